@@ -1,0 +1,13 @@
+"""What goes wrong by a user's mistake, as opposed to a fault of this program."""
+
+
+class UserError(Exception):
+    """A mistake that the user can mend.
+
+    The message is one line: what is wrong (with the file's name) and what to do. The command line prints it
+    without a traceback and exits with code 2.
+    """
+
+
+class WildGSWarning(UserWarning):
+    """Something was left out and work goes on; the message says what is lost and how to get it."""

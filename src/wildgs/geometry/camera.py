@@ -1,0 +1,80 @@
+"""Pinhole cameras: one convention for the whole house."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Axes are OpenCV's and COLMAP's: x right, y down, z forward. The centre of the top left pixel lies at
+    (0.5, 0.5), so a point in front of the camera projects to ``K @ (x / z, y / z, 1)`` in pixels.
+
+    Attributes:
+        viewmat: World-to-camera rigid transform.
+        K: Intrinsics in pixels.
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """The camera's centre in world coordinates."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    @property
+    def forward(self) -> Float[Tensor, "3"]:
+        """The viewing direction (unit length) in world coordinates."""
+        return self.viewmat[2, :3]
+
+    @property
+    def up(self) -> Float[Tensor, "3"]:
+        """The upward direction of the picture (unit length) in world coordinates."""
+        return -self.viewmat[1, :3]
+
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera with its tensors on another device."""
+        return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view sampled on another pixel grid; intrinsics follow per axis."""
+        scale = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
+        return replace(self, K=self.K * scale[:, None], width=width, height=height)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The part of the picture that starts at pixel (left, top)."""
+        K = self.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        return replace(self, K=K, width=width, height=height)
+
+    def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+        """World points of all pixels at the given depths.
+
+        Args:
+            depth: Distance along the camera's z axis (not along the ray), world units.
+
+        Returns:
+            World coordinates of every pixel's centre at its depth.
+        """
+        rays = self.pixel_rays()
+        rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
+        return (rays * depth[..., None] - translation) @ rotation
+
+    def pixel_rays(self) -> Float[Tensor, "H W 3"]:
+        """Camera-space rays through the pixels' centres, scaled so that z = 1."""
+        x = (torch.arange(self.width, device=self.K.device) + 0.5 - self.K[0, 2]) / self.K[0, 0]
+        y = (torch.arange(self.height, device=self.K.device) + 0.5 - self.K[1, 2]) / self.K[1, 1]
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        return torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1)
