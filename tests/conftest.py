@@ -1,0 +1,51 @@
+"""Shape checks for the whole package, and visible skips for what a machine lacks."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+SOURCE = Path(__file__).parent.parent / "src"
+SHARED = Path(__file__).parents[2] / "shared"
+
+
+def _modules_to_check() -> list[str]:
+    """Every module but packages and those that hold Numba kernels, which a decorator would break."""
+    modules = []
+    for file in sorted(SOURCE.rglob("*.py")):
+        if file.name != "__init__.py" and "njit" not in file.read_text(encoding="utf-8"):
+            modules.append(".".join(file.relative_to(SOURCE).with_suffix("").parts))
+    return modules
+
+
+install_import_hook(_modules_to_check(), "beartype.beartype")
+
+
+def _missing(marker: str) -> str | None:
+    if marker == "shared" and not (SHARED / "data").is_dir():
+        return "no ../shared folder beside the checkout"
+    if marker == "chromium" and not (shutil.which("chromium") or shutil.which("google-chrome")):
+        return "no Chromium on the PATH"
+    if marker == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            return "no CUDA device"
+    return None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    reasons = {marker: _missing(marker) for marker in ("shared", "chromium", "cuda")}
+    for item in items:
+        for marker, reason in reasons.items():
+            if reason and item.get_closest_marker(marker):
+                item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with real photos and scenes; tests that use it carry the marker `shared`."""
+    return SHARED
