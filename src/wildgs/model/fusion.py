@@ -1,0 +1,77 @@
+"""The fusion network M^F (paper, Hierarchical Appearance Modeling): three features to spherical harmonics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """The fusion network.
+
+    Attributes:
+        intrinsic_size: Length of the intrinsic feature (paper: 32).
+        hidden: Width of the two hidden layers.
+        sh_degree: Degree of the predicted spherical harmonics.
+        output_scale: Factor on the output layer's initial weights.
+    """
+
+    intrinsic_size: int = 32
+    hidden: int = 64
+    sh_degree: int = 3
+    output_scale: float = 0.1
+
+
+class Fusion(nn.Module):
+    """sh_i = M^F(Emb^g ⊕ Emb^l_i ⊕ f^in_i), shared by all Gaussians.
+
+    A linear path from the intrinsic feature to the output runs beside the hidden layers. At the start it copies
+    the feature's first three entries to the flat part of the harmonics; `initial_intrinsic` puts the SfM point's
+    colour there, and the hidden layers add little, so training begins near the point cloud's colours.
+    """
+
+    def __init__(self, config: FusionConfig, global_size: int, local_size: int) -> None:
+        super().__init__()
+        self.config = config
+        self.coefficients = (config.sh_degree + 1) ** 2
+        outputs = 3 * self.coefficients
+        self.first_global = nn.Linear(global_size, config.hidden)
+        self.first_rows = nn.Linear(local_size + config.intrinsic_size, config.hidden, bias=False)
+        self.second = nn.Linear(config.hidden, config.hidden)
+        self.output = nn.Linear(config.hidden, outputs)
+        self.direct = nn.Linear(config.intrinsic_size, outputs, bias=False)
+        with torch.no_grad():
+            self.output.weight.mul_(config.output_scale)
+            self.output.bias.zero_()
+            self.direct.weight.zero_()
+            self.direct.weight[:3, :3] = torch.eye(3)
+
+    def initial_intrinsic(self, colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P I"]:
+        """Intrinsic features with which the colours come out flat: their SH constants, then small noise."""
+        rows = 0.1 * torch.randn(len(colors), self.config.intrinsic_size)
+        rows[:, :3] = rgb_to_sh0(colors)
+        return rows
+
+    def forward(
+        self,
+        global_embedding: Float[Tensor, " G"],
+        local_embeddings: Float[Tensor, "N L"],
+        intrinsic: Float[Tensor, "N I"],
+    ) -> Float[Tensor, "N K 3"]:
+        """SH coefficients of every Gaussian.
+
+        The first layer is split: the global embedding's share is the same for all Gaussians and computed once.
+        """
+        rows = torch.cat([local_embeddings.to(intrinsic.dtype), intrinsic], dim=1)
+        hidden = (self.first_rows(rows) + self.first_global(global_embedding)).relu()
+        hidden = self.second(hidden).relu()
+        # The direct path carries the base colour and stays in full precision under autocast.
+        with torch.autocast(intrinsic.device.type, enabled=False):
+            direct = self.direct(intrinsic)
+        return (self.output(hidden).float() + direct).reshape(-1, self.coefficients, 3)

@@ -1,0 +1,89 @@
+"""The explicit scene: N Gaussians, each a row in every per-Gaussian parameter."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from wildgs.rasterize import Projection, project
+from wildgs.geometry.camera import Camera
+
+INITIAL_OPACITY = 0.1
+
+
+class Gaussians(nn.Module):
+    """Geometry of the Gaussians plus whatever per-Gaussian features a method adds.
+
+    Every parameter in `rows` has N rows. Densification edits all of them together, so a feature that is
+    registered here travels with clone, split and prune without further care.
+
+    Stored values are raw: `log_scales` (exp gives world units), `opacity_logits` (sigmoid gives opacity),
+    `quats` (w, x, y, z, not normalised).
+    """
+
+    def __init__(self, rows: dict[str, Tensor]) -> None:
+        """Args:
+        rows: Initial values; must hold means, quats, log_scales and opacity_logits.
+        """
+        super().__init__()
+        self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})
+
+    def __len__(self) -> int:
+        return self.rows["means"].shape[0]
+
+    @property
+    def means(self) -> Float[Tensor, "N 3"]:
+        """Centres in the scene's aligned frame."""
+        return self.rows["means"]
+
+    @property
+    def quats(self) -> Float[Tensor, "N 4"]:
+        """Orientations (w, x, y, z), not normalised."""
+        return self.rows["quats"]
+
+    @property
+    def scales(self) -> Float[Tensor, "N 3"]:
+        """Standard deviations along the Gaussian's own axes, world units."""
+        return self.rows["log_scales"].exp()
+
+    @property
+    def opacities(self) -> Float[Tensor, "N"]:
+        """Opacities in (0, 1)."""
+        return self.rows["opacity_logits"].sigmoid()
+
+    def project(self, camera: Camera, *, absgrad: bool = False) -> Projection:
+        """Projects and bins all Gaussians for one camera."""
+        return project(self.means, self.quats, self.scales, self.opacities, camera, absgrad=absgrad)
+
+
+def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
+    """Initial geometry as 3D Gaussian Splatting starts: round Gaussians as wide as their neighbours are far.
+
+    Args:
+        points: Sparse SfM points, world units.
+
+    Returns:
+        Rows for `Gaussians`: means, quats, log_scales (mean distance to the three nearest points) and
+        opacity_logits.
+    """
+    count = points.shape[0]
+    neighbours = min(4, count)
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=neighbours, workers=-1)
+    nearest = torch.from_numpy(distances).reshape(count, neighbours)[:, 1:].float()
+    spacing = (nearest.square().mean(dim=1)).sqrt() if neighbours > 1 else torch.ones(count)
+    spacing = spacing.clamp(1e-4, max(float(spacing.median()) * 20, 1e-4))
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    return {
+        "means": points.float().clone(),
+        "quats": quats,
+        "log_scales": spacing.log()[:, None].repeat(1, 3),
+        "opacity_logits": torch.full((count,), INITIAL_OPACITY).logit(),
+    }
+
+
+def colors_to_unit(colors: UInt8[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+    """8-bit colours as floats in [0, 1]."""
+    return colors.float() / 255.0

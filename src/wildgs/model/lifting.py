@@ -1,0 +1,35 @@
+"""Back-projection of a photo's static pixels to a coloured point cloud (paper, Triplane Color Creation)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wildgs.geometry.camera import Camera
+
+MIN_ALPHA = 0.5
+"""Rendered depth means something only where the Gaussians cover a pixel."""
+
+
+def liftable(
+    visibility: Float[Tensor, "H W"] | None, alpha: Float[Tensor, "H W"], threshold: float
+) -> Bool[Tensor, "H W"]:
+    """Pixels that may be lifted: static (M > Th) and covered by Gaussians."""
+    covered = alpha > MIN_ALPHA
+    return covered if visibility is None else covered & (visibility > threshold)
+
+
+@torch.no_grad()
+def lift(
+    photo: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], keep: Bool[Tensor, "H W"], camera: Camera
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+    """BP: the kept pixels as world points P and their colours C.
+
+    Args:
+        photo: RGB in [0, 1].
+        depth: Expected depth along the camera's z axis, world units.
+        keep: Pixels to lift.
+        camera: The photo's camera.
+    """
+    return camera.unproject(depth)[keep], photo[keep]

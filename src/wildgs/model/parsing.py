@@ -1,0 +1,87 @@
+"""2D Parsing (paper, figure 2 left): visibility mask and global appearance embedding of a photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from wildgs.model.encoder import FEATURE_WIDTHS, RESNET18, Encoder, load_encoder
+from wildgs.model.unet import UpBlock
+
+STATIC_BIAS = 2.0
+"""Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
+
+
+@dataclass(frozen=True)
+class ParsingConfig:
+    """2D Parsing.
+
+    Attributes:
+        encoder: ResNet-18's folder or hub name.
+        max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
+            anyway, and cost grows with the square.
+        global_size: Length of the global embedding (paper: 16).
+        decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
+    """
+
+    encoder: str = RESNET18
+    max_side: int = 256
+    global_size: int = 16
+    decoder_widths: tuple[int, int, int] = (128, 64, 32)
+
+
+class Parsing(nn.Module):
+    """UNet with a ResNet-18 encoder: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder)."""
+
+    def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
+        """Args:
+        config: Sizes and sources.
+        encoder: Overrides the encoder that `config` names.
+        """
+        super().__init__()
+        self.config = config
+        self.encoder = encoder or load_encoder(config.encoder)
+        deep = FEATURE_WIDTHS[-1]
+        self.global_mlp = nn.Sequential(nn.Linear(deep, 64), nn.ReLU(), nn.Linear(64, config.global_size))
+        widths = (deep, *config.decoder_widths)
+        self.decoder = nn.ModuleList(
+            UpBlock(widths[level], FEATURE_WIDTHS[3 - level], widths[level + 1]) for level in range(3)
+        )
+        self.mask_head = nn.Conv2d(widths[-1], 1, 1)
+        nn.init.zeros_(self.mask_head.weight)
+        nn.init.constant_(self.mask_head.bias, STATIC_BIAS)
+
+    def forward(
+        self, photo: Float[Tensor, "H W 3"]
+    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
+        """Parses one photo.
+
+        Args:
+            photo: RGB in [0, 1].
+
+        Returns:
+            The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
+        """
+        features = self.encoder(self.shrink(photo))
+        embedding = self.global_mlp(features[-1].float().mean(dim=(2, 3)))[0]
+        x = features[-1]
+        for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
+            x = block(x, skip)
+        logits = functional.interpolate(
+            self.mask_head(x).float(), size=photo.shape[:2], mode="bilinear", align_corners=False
+        )
+        return logits[0, 0].sigmoid(), embedding.float()
+
+    def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
+        """The photo as a batch of one, at most `max_side` long."""
+        image = photo.permute(2, 0, 1)[None]
+        height, width = photo.shape[:2]
+        factor = self.config.max_side / max(height, width)
+        if factor >= 1:
+            return image
+        size = (max(1, round(height * factor)), max(1, round(width * factor)))
+        return functional.interpolate(image, size=size, mode="bilinear", antialias=True)

@@ -1,0 +1,120 @@
+"""The triplane: six orthographic pictures of a coloured cloud in, features at any point out.
+
+Planes are XY, YZ and ZX of the scene's aligned frame, in this order everywhere. On plane (a, b) the column of
+a cell follows axis a and the row follows axis b; the third axis is the one along which the plane looks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+PLANE_AXES = ((0, 1), (1, 2), (2, 0))
+VIEW_AXIS = (2, 0, 1)
+PICTURE_CHANNELS = 4
+"""Red, green, blue, validity."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned bounding box (AABB) in the scene's aligned frame.
+
+    Attributes:
+        low: Lower corner.
+        high: Upper corner.
+    """
+
+    low: Float[Tensor, "3"]
+    high: Float[Tensor, "3"]
+
+    def normalize(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Coordinates in [-1, 1] inside the box: the paper's P̃."""
+        return (points - self.low) / (self.high - self.low) * 2 - 1
+
+    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
+        """Which points lie inside."""
+        return ((points >= self.low) & (points <= self.high)).all(dim=-1)
+
+
+def robust_box(points: Float[Tensor, "P 3"], quantile: float, ratio: float) -> Box:
+    """The box that holds most points, shrunk towards their median (paper, Efficient Triplane Sampling).
+
+    Args:
+        points: Sparse SfM points; far outliers are normal.
+        quantile: Share of points left out on each side of each axis.
+        ratio: Crop ratio: 1 keeps the whole box, 0.5 half of its sides.
+    """
+    ordered = points.sort(dim=0).values
+    last = len(points) - 1
+    low = ordered[round(quantile * last)]
+    high = ordered[round((1 - quantile) * last)]
+    middle = ordered[last // 2]
+    reach = (high - low).max().clamp_min(1e-6)
+    low = torch.minimum(middle + ratio * (low - middle), middle - 0.01 * reach)
+    high = torch.maximum(middle + ratio * (high - middle), middle + 0.01 * reach)
+    return Box(low, high)
+
+
+def project_cloud(
+    points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"], resolution: int
+) -> Float[Tensor, "3 2 4 R R"]:
+    """Orthographic pictures of a coloured cloud: c and c' on XY, YZ and ZX (paper, Triplane Color Creation).
+
+    Of the points that fall into one cell, the one nearest to the viewer wins. Both directions of a plane share
+    the grid (the reverse is not mirrored), so that a cell means the same line in space in c and in c'.
+
+    Args:
+        points: Normalised positions; those outside [-1, 1] are left out.
+        colors: RGB in [0, 1].
+        resolution: Cells per side, R.
+
+    Returns:
+        Per plane: the picture seen from the positive end of the third axis (c), then from the negative end (c').
+        Channels are red, green, blue, validity; empty cells are zero.
+    """
+    inside = (points.abs() <= 1).all(dim=-1)
+    points, colors = points[inside], colors[inside]
+    pictures = colors.new_zeros(6, PICTURE_CHANNELS, resolution * resolution)
+    if len(points):
+        cells = ((points + 1) * (0.5 * resolution)).long().clamp_(max=resolution - 1)
+        filled = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1).T
+        for plane, (column, row) in enumerate(PLANE_AXES):
+            cell = cells[:, row] * resolution + cells[:, column]
+            height = points[:, VIEW_AXIS[plane]]
+            for reverse, distance in enumerate((-height, height)):
+                hit, winner = _nearest_per_cell(cell, distance, resolution * resolution)
+                pictures[plane * 2 + reverse][:, hit] = filled[:, winner]
+    return pictures.reshape(3, 2, PICTURE_CHANNELS, resolution, resolution)
+
+
+def _nearest_per_cell(
+    cell: Tensor, distance: Float[Tensor, " P"], num_cells: int
+) -> tuple[Tensor, Tensor]:
+    """Cells that are hit, and the index of the nearest point in each; ties go to the first point."""
+    # One integer that orders by distance first and by index second makes scatter-min yield the winner itself.
+    ordinal = ((distance + 1) * (2**30 - 1)).long().clamp_(0, 2**31 - 2)
+    key = (ordinal << 32) | torch.arange(len(cell), device=cell.device)
+    none = torch.iinfo(torch.int64).max
+    best = torch.full((num_cells,), none, device=cell.device).scatter_reduce(0, cell, key, "amin")
+    hit = (best != none).nonzero()[:, 0]
+    return hit, best[hit] & 0xFFFFFFFF
+
+
+def sample_planes(
+    planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N C"]:
+    """f_xy + f_yz + f_zx: bilinear samples of the three planes at points, summed.
+
+    Args:
+        planes: Feature maps of XY, YZ and ZX.
+        points: Normalised positions in [-1, 1]; cell centres lie at (2 i + 1) / R - 1.
+    """
+    grid = torch.stack([points[:, axes] for axes in (list(pair) for pair in PLANE_AXES)])
+    sampled = functional.grid_sample(
+        planes, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled.sum(dim=0)[:, 0].T

@@ -1,0 +1,158 @@
+"""Wild-GS whole: the paper's figure 2 as wiring, nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from wildgs.geometry.camera import Camera
+from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.encoder import Encoder
+from wildgs.model.fusion import Fusion, FusionConfig
+from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_points
+from wildgs.model.lifting import lift, liftable
+from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
+from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.triplane import Box, robust_box
+from wildgs.model.wrapping import Wrapping, WrappingConfig
+from wildgs.rasterize import Projection, blend
+
+Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
+"""Parts that can be taken away: the paper's five, and the intrinsic and local features."""
+
+
+@dataclass(frozen=True)
+class WildGSConfig:
+    """The model.
+
+    Attributes:
+        without: Parts left out, for ablations ('depth' is the trainer's affair and changes nothing here).
+        mask_threshold: Th: pixels above it are static (lifting, depth loss).
+        parsing: 2D Parsing.
+        wrapping: 3D Wrapping.
+        fusion: The fusion network.
+    """
+
+    without: tuple[Ablation, ...] = ()
+    mask_threshold: float = 0.5
+    parsing: ParsingConfig = field(default_factory=ParsingConfig)
+    wrapping: WrappingConfig = field(default_factory=WrappingConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+
+
+class WildGS(Method):
+    """Gaussians whose colours are fused from a photo's global light, its local light, and their own nature."""
+
+    def __init__(
+        self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
+    ) -> None:
+        """Args:
+        config: The model's configuration.
+        gaussians: With a row `intrinsic` beside the geometry.
+        box: What the triplane covers.
+        encoder: Overrides the encoder that `config` names.
+        """
+        super().__init__()
+        self.config = config
+        self.gaussians = gaussians
+        self.sh_degree = config.fusion.sh_degree
+        self.parsing = Parsing(config.parsing, encoder)
+        self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
+        self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
+
+    @classmethod
+    def from_points(
+        cls,
+        config: WildGSConfig,
+        points: Float[Tensor, "P 3"],
+        colors: UInt8[Tensor, "P 3"],
+        encoder: Encoder | None = None,
+    ) -> WildGS:
+        """Starts from SfM points and their colours, in the scene's aligned frame."""
+        ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
+        box = robust_box(points, config.wrapping.box_quantile, ratio)
+        rows = geometry_from_points(points)
+        rows["intrinsic"] = torch.zeros(len(points), config.fusion.intrinsic_size)
+        model = cls(config, Gaussians(rows), box, encoder)
+        with torch.no_grad():
+            intrinsic = model.fusion.initial_intrinsic(colors_to_unit(colors))
+            model.gaussians.rows["intrinsic"].copy_(intrinsic)
+        return model
+
+    def _lacks(self, part: Ablation) -> bool:
+        return part in self.config.without
+
+    def encode(self, photo: Float[Tensor, "H W 3"], camera: Camera) -> Appearance:
+        """Parses the photo, lifts its static pixels by the rendered depth, and builds the triplane."""
+        appearance = self.parse(photo)
+        if self._lacks("local"):
+            return appearance
+        with torch.no_grad():
+            projection = self.gaussians.project(camera)
+        return self.wrap(photo, camera, appearance, projection)
+
+    def parse(self, photo: Float[Tensor, "H W 3"]) -> Appearance:
+        """2D Parsing: mask and global embedding; local appearance is left to v."""
+        visibility, embedding = self.parsing(photo)
+        if self._lacks("global"):
+            embedding = torch.zeros_like(embedding)
+        return Appearance(embedding, None, None if self._lacks("mask") else visibility)
+
+    def wrap(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        appearance: Appearance,
+        projection: Projection,
+    ) -> Appearance:
+        """3D Wrapping: adds the triplane, from depth that takes no gradient.
+
+        Args:
+            photo: RGB in [0, 1].
+            camera: Its camera.
+            appearance: From `parse`.
+            projection: The Gaussians as `camera` sees them; only geometry is used.
+        """
+        with torch.no_grad():
+            geometry = blend(projection, None)
+            keep = liftable(appearance.visibility, geometry.alpha, self.config.mask_threshold)
+            points, colors = lift(photo, geometry.depth, keep, camera)
+        return replace(appearance, planes=self.wrapping.planes(points, colors))
+
+    def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
+        """Carries an appearance to the Gaussians."""
+        means = self.gaussians.means if rows is None else self.gaussians.means[rows]
+        assert appearance.global_embedding is not None
+        local = self.wrapping.local_embeddings(appearance.planes, means)
+        return Embeddings(appearance.global_embedding, local)
+
+    def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
+        """sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
+        intrinsic = self.gaussians.rows["intrinsic"]
+        if rows is not None:
+            intrinsic = intrinsic[rows]
+        if self._lacks("intrinsic"):
+            intrinsic = torch.zeros_like(intrinsic)
+        return self.fusion(embeddings.global_embedding, embeddings.local_embeddings, intrinsic)
+
+    def shade(
+        self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None
+    ) -> Float[Tensor, "N K 3"]:
+        """Spherical harmonics under an appearance: sample, embed, fuse."""
+        return self.fuse(self.embed(appearance, rows), rows)
+
+    def training_pass(self, photo: Float[Tensor, "H W 3"], camera: Camera, stage: Stage) -> TrainingOutput:
+        """The photo is its own reference; one projection serves the depth pass and the colours."""
+        appearance = self.parse(photo)
+        if not stage.learn_mask and appearance.visibility is not None:
+            appearance = replace(appearance, visibility=appearance.visibility.detach())
+        projection = self.gaussians.project(camera)
+        projection.means2d.retain_grad()
+        if stage.explicit and not self._lacks("local"):
+            appearance = self.wrap(photo, camera, appearance, projection)
+        colors = paint_visible(self, projection, appearance, stage.sh_degree)
+        return TrainingOutput(blend(projection, colors), projection, appearance.visibility)

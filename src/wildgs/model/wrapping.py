@@ -1,0 +1,88 @@
+"""3D Wrapping (paper, figure 2 right): the local appearance embedding of every Gaussian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_planes
+from wildgs.model.unet import UNet
+
+
+@dataclass(frozen=True)
+class WrappingConfig:
+    """3D Wrapping.
+
+    Attributes:
+        resolution: Cells per side of a plane.
+        features: Channels of a plane's feature map.
+        widths: Channels of the plane UNet, from full resolution down.
+        local_size: Length of the local embedding (paper: 16).
+        crop_ratio: Share of the robust box's sides that the triplane covers (paper: 0.5).
+        box_quantile: Share of SfM points outside the robust box on each side of each axis.
+    """
+
+    resolution: int = 128
+    features: int = 32
+    widths: tuple[int, ...] = (16, 32, 64, 64)
+    local_size: int = 16
+    crop_ratio: float = 0.5
+    box_quantile: float = 0.005
+
+
+class Wrapping(nn.Module):
+    """Coloured cloud -> six pictures -> U^3D -> Emb^l per point; the learnable v outside the box."""
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, config: WrappingConfig, box: Box, *, reverse: bool = True) -> None:
+        """Args:
+        config: Sizes.
+        box: What the triplane covers.
+        reverse: Whether the reverse projections c' are used (off: the ablation 'w/o {c'}').
+        """
+        super().__init__()
+        self.config = config
+        self.reverse = reverse
+        self.register_buffer("low", box.low.clone())
+        self.register_buffer("high", box.high.clone())
+        directions = 2 if reverse else 1
+        self.unet = UNet(PICTURE_CHANNELS * directions, config.widths, config.features)
+        self.local_mlp = nn.Sequential(
+            nn.Linear(config.features, 32), nn.ReLU(), nn.Linear(32, config.local_size)
+        )
+        self.outside = nn.Parameter(torch.zeros(config.local_size))
+
+    @property
+    def box(self) -> Box:
+        """The AABB that the triplane covers."""
+        return Box(self.low, self.high)
+
+    def planes(
+        self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]
+    ) -> Float[Tensor, "3 C R R"]:
+        """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates."""
+        pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution)
+        if not self.reverse:
+            pictures = pictures[:, :1]
+        return self.unet(pictures.flatten(1, 2))
+
+    def local_embeddings(
+        self, planes: Float[Tensor, "3 C R R"] | None, means: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N L"]:
+        """Emb^l of every Gaussian: sampled from the planes inside the box, v outside or without planes.
+
+        The centres get no gradient: the appearance of one photo should not move the geometry of all.
+        """
+        everywhere = self.outside.expand(len(means), -1)
+        if planes is None:
+            return everywhere
+        means = means.detach()
+        inside = self.box.contains(means).nonzero()[:, 0]
+        sampled = sample_planes(planes.float(), self.box.normalize(means[inside]))
+        local = self.local_mlp(sampled)
+        return everywhere.to(local.dtype).index_copy(0, inside, local)
