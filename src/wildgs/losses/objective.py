@@ -1,0 +1,118 @@
+"""The paper's total loss, a line per term."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wildgs.losses.depth import depth_correlation
+from wildgs.losses.photometric import masked_photometric
+from wildgs.losses.visibility import visibility_regularizer
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights of the total loss (paper's equation of L_total).
+
+    Attributes:
+        weight_l1: λ^I, share of L1 against structural dissimilarity in the image loss.
+        mask_weight_start: λ^M at the first step.
+        mask_weight_end: λ^M at the last step; linear in between.
+        depth_weight: λ^D.
+        mask_threshold: Th, above which a pixel counts as static for the depth loss.
+        min_alpha: Least accumulated alpha of a pixel whose rendered depth is compared.
+    """
+
+    weight_l1: float = 0.8
+    mask_weight_start: float = 0.4
+    mask_weight_end: float = 0.1
+    depth_weight: float = 0.05
+    mask_threshold: float = 0.5
+    min_alpha: float = 0.5
+
+    def mask_weight(self, progress: float) -> float:
+        """λ^M at a share of the training, 0 at its start and 1 at its end (clamped)."""
+        share = min(max(progress, 0.0), 1.0)
+        return self.mask_weight_start + (self.mask_weight_end - self.mask_weight_start) * share
+
+
+@dataclass
+class Losses:
+    """Terms of one step, unweighted, and their weighted sum.
+
+    Attributes:
+        image: L^I.
+        mask: L^M; 0 where there is no mask to learn.
+        depth: L^D; 0 where there is no estimate.
+        total: ``L^I + λ^M L^M + λ^D L^D``, to be differentiated.
+    """
+
+    image: Float[Tensor, ""]
+    mask: Float[Tensor, ""]
+    depth: Float[Tensor, ""]
+    total: Float[Tensor, ""]
+
+    def as_floats(self) -> dict[str, float]:
+        """The four numbers for a log."""
+        names = ("image", "mask", "depth", "total")
+        values = torch.stack([getattr(self, name).detach() for name in names]).tolist()
+        return dict(zip(names, values, strict=True))
+
+
+def total_loss(
+    config: ObjectiveConfig,
+    progress: float,
+    photo: Float[Tensor, "H W 3"],
+    render: Float[Tensor, "H W 3"],
+    *,
+    visibility: Float[Tensor, "H W"] | None = None,
+    keep: Bool[Tensor, "H W"] | None = None,
+    depth: Float[Tensor, "H W"] | None = None,
+    alpha: Float[Tensor, "H W"] | None = None,
+    disparity: Float[Tensor, "H W"] | None = None,
+    train_mask: bool = True,
+) -> Losses:
+    """The paper's L_total for one photo.
+
+    Args:
+        config: Weights.
+        progress: Share of the training done, 0..1, for λ^M.
+        photo: I in 0..1.
+        render: Î.
+        visibility: M as predicted; None for a method without a mask (all visible, no mask loss).
+        keep: The user's own mask, False = ignore. Ignored pixels count in no term.
+        depth: Rendered expected depth; the depth loss needs it and `disparity`.
+        alpha: Accumulated alpha of the render; pixels below `min_alpha` are left out of the depth loss.
+        disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
+        train_mask: False passes no gradient to the mask (the pause after an opacity reset).
+
+    Returns:
+        All terms.
+    """
+    if visibility is not None and not train_mask:
+        visibility = visibility.detach()
+    image = masked_photometric(photo, render, _kept(visibility, keep, photo), config.weight_l1)
+    total, zero = image, image.new_zeros(())
+    mask = depth_term = zero
+    if visibility is not None:
+        mask = visibility_regularizer(visibility if keep is None else torch.where(keep, visibility, 1.0))
+        total = total + config.mask_weight(progress) * mask
+    if depth is not None and disparity is not None:
+        selection = torch.ones_like(depth, dtype=torch.bool) if keep is None else keep
+        if visibility is not None:
+            selection = selection & (visibility.detach() > config.mask_threshold)
+        if alpha is not None:
+            selection = selection & (alpha.detach() > config.min_alpha)
+        depth_term = depth_correlation(depth, disparity, selection)
+        total = total + config.depth_weight * depth_term
+    return Losses(image=image, mask=mask, depth=depth_term, total=total)
+
+
+def _kept(visibility: Tensor | None, keep: Tensor | None, photo: Tensor) -> Tensor | None:
+    """The mask of the image loss: the predicted one, zero where the user's mask ignores."""
+    if keep is None:
+        return visibility
+    return keep.to(photo.dtype) if visibility is None else visibility * keep

@@ -1,0 +1,109 @@
+"""Numba kernels of the structural similarity and its gradient.
+
+A picture is a matrix of H rows and L = W * C numbers (channels interleaved), so that one inner loop runs over
+all channels of a row and the horizontal window steps by C. Rows are independent, so results do not depend on
+the number of threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+RADIUS = 5
+_MATHS = {"reassoc", "contract", "arcp", "nsz"}  # not nnan: a NaN must stay visible
+
+
+@njit(fastmath=_MATHS, error_model="numpy", cache=True)
+def _filter_row(padded, taps, channels, out):
+    """Filter one row that has RADIUS * channels zeros on either side.
+
+    The views keep every index a plain loop variable, without which LLVM does not vectorise the loop.
+    """
+    length = out.shape[0]
+    a0, a1 = padded[0:length], padded[10 * channels : 10 * channels + length]
+    b0, b1 = padded[channels : channels + length], padded[9 * channels : 9 * channels + length]
+    c0, c1 = padded[2 * channels : 2 * channels + length], padded[8 * channels : 8 * channels + length]
+    d0, d1 = padded[3 * channels : 3 * channels + length], padded[7 * channels : 7 * channels + length]
+    e0, e1 = padded[4 * channels : 4 * channels + length], padded[6 * channels : 6 * channels + length]
+    centre = padded[5 * channels : 5 * channels + length]
+    wa, wb, wc, wd, we, w = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
+    for j in range(length):
+        tails = wa * (a0[j] + a1[j]) + wb * (b0[j] + b1[j]) + wc * (c0[j] + c1[j])
+        out[j] = tails + wd * (d0[j] + d1[j]) + we * (e0[j] + e1[j]) + w * centre[j]
+
+
+@njit(parallel=True, fastmath=_MATHS, error_model="numpy", cache=True)
+def ssim_forward(x, y, taps, c1, c2, channels, d_mean_x, d_mean_y, d_square, d_cross, row_sums):
+    """Sum the SSIM map per row and keep its derivatives by the window's moments.
+
+    With E the window's weighted mean, writes d ssim / d E[x], d E[y], d E[x^2] (the same as d E[y^2]) and
+    d E[xy], each [H, L].
+    """
+    height, length = x.shape
+    pad = RADIUS * channels
+    for i in prange(height):
+        sums = np.zeros((5, length + 2 * pad), dtype=x.dtype)
+        sx, sy = sums[0, pad : pad + length], sums[1, pad : pad + length]
+        sxx, syy, sxy = sums[2, pad : pad + length], sums[3, pad : pad + length], sums[4, pad : pad + length]
+        for k in range(max(0, RADIUS - i), min(2 * RADIUS + 1, height + RADIUS - i)):
+            w, u, v = taps[k], x[i + k - RADIUS], y[i + k - RADIUS]
+            for j in range(length):
+                wu, wv = w * u[j], w * v[j]
+                sx[j] += wu
+                sy[j] += wv
+                sxx[j] += wu * u[j]
+                syy[j] += wv * v[j]
+                sxy[j] += wu * v[j]
+        means = np.empty((5, length), dtype=x.dtype)
+        for k in range(5):
+            _filter_row(sums[k], taps, channels, means[k])
+        mx, my, mxx, myy, mxy = means[0], means[1], means[2], means[3], means[4]
+        out_x, out_y, out_s, out_c = d_mean_x[i], d_mean_y[i], d_square[i], d_cross[i]
+        total = x.dtype.type(0)
+        for j in range(length):
+            p, q = mx[j], my[j]
+            a = 2 * p * q + c1
+            b = 2 * (mxy[j] - p * q) + c2
+            c = p * p + q * q + c1
+            d = mxx[j] + myy[j] - p * p - q * q + c2
+            inverse = 1 / (c * d)
+            value = a * b * inverse
+            total += value
+            by_b, by_d = a * inverse, -value * c * inverse
+            by_a, by_c = b * inverse - by_b, -value * d * inverse - by_d
+            out_x[j] = 2 * (q * by_a + p * by_c)
+            out_y[j] = 2 * (p * by_a + q * by_c)
+            out_s[j] = by_d
+            out_c[j] = 2 * by_b
+        row_sums[i] = total
+
+
+@njit(parallel=True, fastmath=_MATHS, error_model="numpy", cache=True)
+def ssim_backward(x, y, taps, scale, channels, d_mean_x, d_mean_y, d_square, d_cross, grad_x, grad_y):
+    """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept.
+
+    The window is symmetric, so the adjoint of filtering with zero padding is the same filtering.
+    """
+    height, length = x.shape
+    pad = RADIUS * channels
+    for i in prange(height):
+        sums = np.zeros((4, length + 2 * pad), dtype=x.dtype)
+        s0, s1 = sums[0, pad : pad + length], sums[1, pad : pad + length]
+        s2, s3 = sums[2, pad : pad + length], sums[3, pad : pad + length]
+        for k in range(max(0, RADIUS - i), min(2 * RADIUS + 1, height + RADIUS - i)):
+            r = i + k - RADIUS
+            w, p0, p1, p2, p3 = scale * taps[k], d_mean_x[r], d_mean_y[r], d_square[r], d_cross[r]
+            for j in range(length):
+                s0[j] += w * p0[j]
+                s1[j] += w * p1[j]
+                s2[j] += w * p2[j]
+                s3[j] += w * p3[j]
+        means = np.empty((4, length), dtype=x.dtype)
+        for k in range(4):
+            _filter_row(sums[k], taps, channels, means[k])
+        m0, m1, m2, m3 = means[0], means[1], means[2], means[3]
+        u, v, out_x, out_y = x[i], y[i], grad_x[i], grad_y[i]
+        for j in range(length):
+            out_x[j] = m0[j] + 2 * m2[j] * u[j] + m3[j] * v[j]
+            out_y[j] = m1[j] + 2 * m2[j] * v[j] + m3[j] * u[j]

@@ -1,0 +1,92 @@
+import pytest
+import torch
+
+from wildgs.losses.depth import depth_correlation
+from wildgs.losses.objective import ObjectiveConfig, total_loss
+from wildgs.losses.photometric import masked_photometric
+from wildgs.losses.visibility import visibility_regularizer
+
+H, W = 24, 32
+
+
+@pytest.fixture
+def inputs() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return {
+        "photo": torch.rand(H, W, 3, generator=generator),
+        "render": torch.rand(H, W, 3, generator=generator).requires_grad_(),
+        "visibility": torch.rand(H, W, generator=generator).requires_grad_(),
+        "depth": (torch.rand(H, W, generator=generator) + 1).requires_grad_(),
+        "alpha": torch.rand(H, W, generator=generator).requires_grad_(),
+        "disparity": torch.rand(H, W, generator=generator) + 0.1,
+    }
+
+
+def test_regularizer_is_the_mean_square_of_what_is_hidden():
+    assert visibility_regularizer(torch.ones(H, W)).item() == 0
+    assert visibility_regularizer(torch.full((H, W), 0.25)).item() == pytest.approx(0.5625)
+
+
+def test_mask_weight_falls_linearly_and_stays_in_its_range():
+    config = ObjectiveConfig()
+    weights = [config.mask_weight(p) for p in (-1, 0, 0.5, 1, 2)]
+    assert weights == pytest.approx([0.4, 0.4, 0.25, 0.1, 0.1])
+
+
+def test_total_is_the_weighted_sum_of_its_terms(inputs):
+    config = ObjectiveConfig(depth_weight=0.3)
+    losses = total_loss(config, 0.5, **inputs)
+    selection = (inputs["visibility"] > 0.5) & (inputs["alpha"] > 0.5)
+    image = masked_photometric(inputs["photo"], inputs["render"], inputs["visibility"], 0.8)
+    mask = visibility_regularizer(inputs["visibility"])
+    depth = depth_correlation(inputs["depth"], inputs["disparity"], selection)
+    assert losses.as_floats() == pytest.approx(
+        {
+            "image": image.item(),
+            "mask": mask.item(),
+            "depth": depth.item(),
+            "total": (image + 0.25 * mask + 0.3 * depth).item(),
+        }
+    )
+
+
+def test_plain_splatting_has_only_the_image_loss(inputs):
+    losses = total_loss(ObjectiveConfig(), 0.0, inputs["photo"], inputs["render"])
+    assert losses.mask.item() == losses.depth.item() == 0
+    assert losses.total.item() == losses.image.item()
+
+
+def test_depth_loss_passes_no_gradient_to_mask_and_alpha(inputs):
+    photo = inputs["photo"].clone()
+    losses = total_loss(ObjectiveConfig(), 0.0, **{**inputs, "photo": photo})
+    by_mask, by_alpha, by_depth = torch.autograd.grad(
+        losses.depth, [inputs["visibility"], inputs["alpha"], inputs["depth"]], allow_unused=True
+    )
+    assert by_mask is None
+    assert by_alpha is None
+    assert by_depth.abs().max() > 0
+    hidden = inputs["visibility"] <= 0.5
+    assert (by_depth[hidden] == 0).all()
+
+
+def test_paused_mask_gets_no_gradient_but_still_masks(inputs):
+    paused = total_loss(ObjectiveConfig(), 0.0, **inputs, train_mask=False)
+    running = total_loss(ObjectiveConfig(), 0.0, **inputs)
+    assert paused.total.item() == pytest.approx(running.total.item())
+    paused.total.backward()
+    assert inputs["visibility"].grad is None
+    assert inputs["render"].grad.abs().max() > 0
+
+
+def test_pixels_that_the_user_ignores_count_in_no_term(inputs):
+    keep = torch.ones(H, W, dtype=torch.bool)
+    keep[5:15, 5:20] = False
+    before = total_loss(ObjectiveConfig(), 0.3, **inputs, keep=keep).as_floats()
+    changed = {name: value.detach().clone() for name, value in inputs.items()}
+    for name in changed:
+        changed[name][5:15, 5:20] = 0.123
+    after = total_loss(ObjectiveConfig(), 0.3, **changed, keep=keep).as_floats()
+    assert after == pytest.approx(before)
+    plain = total_loss(ObjectiveConfig(), 0.3, inputs["photo"], inputs["render"], keep=keep)
+    plain_changed = total_loss(ObjectiveConfig(), 0.3, changed["photo"], changed["render"], keep=keep)
+    assert plain.total.item() == pytest.approx(plain_changed.total.item())

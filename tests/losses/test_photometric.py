@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wildgs.losses.photometric import masked_photometric
+from wildgs.losses.ssim import _ssim_by_convolution, gaussian_taps, ssim
+
+
+def naive_ssim(x: np.ndarray, y: np.ndarray) -> float:
+    """Straight from the definition, one window at a time, zeros outside the picture."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    height, width, channels = x.shape
+    x, y = (np.pad(picture, ((5, 5), (5, 5), (0, 0))) for picture in (x, y))
+    total = 0.0
+    for c in range(channels):
+        for i in range(height):
+            for j in range(width):
+                p, q = x[i : i + 11, j : j + 11, c], y[i : i + 11, j : j + 11, c]
+                mp, mq = (window * p).sum(), (window * q).sum()
+                vp, vq = (window * (p - mp) ** 2).sum(), (window * (q - mq) ** 2).sum()
+                cov = (window * (p - mp) * (q - mq)).sum()
+                luminance = (2 * mp * mq + 1e-4) / (mp**2 + mq**2 + 1e-4)
+                total += luminance * (2 * cov + 9e-4) / (vp + vq + 9e-4)
+    return total / (height * width * channels)
+
+
+def pictures(height: int, width: int, channels: int = 3, seed: int = 0, dtype: torch.dtype = torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.rand(height, width, channels, generator=generator, dtype=dtype)
+    y = (0.6 * x + 0.4 * torch.rand(height, width, channels, generator=generator, dtype=dtype)).contiguous()
+    return x, y
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    height=st.integers(1, 17),
+    width=st.integers(1, 17),
+    channels=st.sampled_from([1, 3]),
+    seed=st.integers(0, 99),
+)
+def test_ssim_agrees_with_the_definition(height, width, channels, seed):
+    x, y = pictures(height, width, channels, seed)
+    assert ssim(x, y).item() == pytest.approx(naive_ssim(x.numpy(), y.numpy()), abs=1e-10)
+
+
+def test_single_precision_agrees_with_double():
+    x, y = pictures(40, 53)
+    assert ssim(x.float(), y.float()).item() == pytest.approx(ssim(x, y).item(), abs=1e-5)
+
+
+def test_ssim_of_a_picture_with_itself_is_one():
+    x, _ = pictures(20, 30)
+    assert ssim(x, x).item() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_pictures_need_not_be_contiguous():
+    x, y = pictures(21, 14)
+    turned = ssim(x.transpose(0, 1), y.transpose(0, 1))
+    assert turned.item() == pytest.approx(ssim(x, y).item(), abs=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 3), (13, 12, 1)])
+def test_ssim_gradient_by_finite_differences(shape):
+    x, y = pictures(*shape)
+    assert torch.autograd.gradcheck(ssim, (x.requires_grad_(), y.requires_grad_()))
+
+
+def test_kernels_and_convolutions_agree_in_value_and_gradient():
+    results = []
+    for function in (ssim, _ssim_by_convolution):
+        x, y = (p.requires_grad_() for p in pictures(23, 31))
+        value = function(x, y)
+        (3 * value).backward()
+        results.append((value.detach(), x.grad, y.grad))
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-12, rtol=1e-9)
+
+
+def test_nan_stays_visible():
+    x, y = pictures(12, 12)
+    x[3, 3, 0] = torch.nan
+    assert ssim(x, y).isnan()
+
+
+def test_window_sums_to_one_and_is_symmetric():
+    taps = gaussian_taps(torch.float64)
+    assert taps.sum().item() == pytest.approx(1.0)
+    assert torch.equal(taps, taps.flip(0))
+
+
+def test_loss_is_l1_plus_dissimilarity():
+    photo, render = pictures(16, 18)
+    expected = 0.8 * np.abs((photo - render).numpy()).mean() + 0.2 * (
+        1 - naive_ssim(photo.numpy(), render.numpy())
+    )
+    assert masked_photometric(photo, render, None, 0.8).item() == pytest.approx(expected, abs=1e-10)
+
+
+def test_full_visibility_is_the_same_as_none():
+    photo, render = pictures(16, 18)
+    ones = torch.ones(16, 18, dtype=torch.float64)
+    assert masked_photometric(photo, render, ones).item() == masked_photometric(photo, render, None).item()
+
+
+def test_hidden_pixels_cost_nothing_and_pull_nothing():
+    photo, render = pictures(24, 24)
+    visibility = torch.ones(24, 24, dtype=torch.float64)
+    visibility[:, 12:] = 0
+    render = render.clone()
+    render[:, :12] = photo[:, :12]
+    render.requires_grad_()
+    loss = masked_photometric(photo, render, visibility)
+    loss.backward()
+    assert loss.item() == pytest.approx(0, abs=1e-12)
+    assert render.grad[:, 12:].abs().max() == 0
+
+
+def test_gradient_reaches_mask_and_render():
+    photo, render = pictures(9, 8)
+    visibility = torch.rand(9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    render, visibility = (render + 0.3).requires_grad_(), visibility.requires_grad_()
+    assert torch.autograd.gradcheck(lambda r, m: masked_photometric(photo, r, m), (render, visibility))
+
+
+def test_hiding_a_wrong_region_lowers_the_loss():
+    photo, _ = pictures(32, 32)
+    render = photo.clone()
+    render[8:24, 8:24] = 1 - render[8:24, 8:24]
+    visibility = torch.full((32, 32), 0.9, dtype=torch.float64, requires_grad=True)
+    masked_photometric(photo, render, visibility).backward()
+    assert visibility.grad[10:22, 10:22].mean() > 0
+    assert visibility.grad[10:22, 10:22].mean() > 10 * visibility.grad[0:2].abs().mean()
