@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.model.precision import MixedModule
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class FusionConfig:
     output_scale: float = 0.1
 
 
-class Fusion(nn.Module):
+class Fusion(MixedModule):
     """sh_i = M^F(Emb^g ⊕ Emb^l_i ⊕ f^in_i), shared by all Gaussians.
 
     A linear path from the intrinsic feature to the output runs beside the hidden layers. At the start it copies
@@ -68,10 +69,10 @@ class Fusion(nn.Module):
 
         The first layer is split: the global embedding's share is the same for all Gaussians and computed once.
         """
-        rows = torch.cat([local_embeddings.to(intrinsic.dtype), intrinsic], dim=1)
-        hidden = (self.first_rows(rows) + self.first_global(global_embedding)).relu()
-        hidden = self.second(hidden).relu()
-        # The direct path carries the base colour and stays in full precision under autocast.
-        with torch.autocast(intrinsic.device.type, enabled=False):
-            direct = self.direct(intrinsic)
-        return (self.output(hidden).float() + direct).reshape(-1, self.coefficients, 3)
+        rows = torch.cat([local_embeddings, intrinsic], dim=1)
+        with self.mixed(rows.device):
+            hidden = (self.first_rows(rows) + self.first_global(global_embedding)).relu()
+            hidden = self.second(hidden).relu()
+            fused = self.output(hidden)
+        # The direct path carries the base colour and stays in full precision.
+        return (fused.float() + self.direct(intrinsic)).reshape(-1, self.coefficients, 3)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
@@ -57,12 +57,15 @@ class Method(nn.Module, ABC):
         return len(self.gaussians)
 
     @abstractmethod
-    def encode(self, photo: Float[Tensor, "H W 3"], camera: Camera) -> Appearance:
+    def encode(
+        self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
+    ) -> Appearance:
         """Reads the appearance of a photo.
 
         Args:
             photo: RGB in [0, 1].
             camera: Its camera, of the photo's size.
+            keep: The user's own mask: pixels that are False are not lifted.
         """
 
     @abstractmethod
@@ -78,7 +81,11 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def training_pass(
-        self, photo: Float[Tensor, "H W 3"], camera: Camera, stage: Stage
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        stage: Stage,
+        keep: Bool[Tensor, "H W"] | None = None,
     ) -> TrainingOutput:
         """Renders a training photo under its own appearance, with gradients."""
 

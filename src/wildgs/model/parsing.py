@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.model.encoder import FEATURE_WIDTHS, RESNET18, Encoder, load_encoder
+from wildgs.model.precision import MixedModule
 from wildgs.model.unet import UpBlock
 
 STATIC_BIAS = 2.0
@@ -34,7 +35,7 @@ class ParsingConfig:
     decoder_widths: tuple[int, int, int] = (128, 64, 32)
 
 
-class Parsing(nn.Module):
+class Parsing(MixedModule):
     """UNet with a ResNet-18 encoder: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder)."""
 
     def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
@@ -66,15 +67,17 @@ class Parsing(nn.Module):
         Returns:
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
-        features = self.encoder(self.shrink(photo))
+        with self.mixed(photo.device):
+            features = self.encoder(self.shrink(photo))
+            x = features[-1]
+            for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
+                x = block(x, skip)
+            coarse = self.mask_head(x)
         embedding = self.global_mlp(features[-1].float().mean(dim=(2, 3)))[0]
-        x = features[-1]
-        for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
-            x = block(x, skip)
         logits = functional.interpolate(
-            self.mask_head(x).float(), size=photo.shape[:2], mode="bilinear", align_corners=False
+            coarse.float(), size=photo.shape[:2], mode="bilinear", align_corners=False
         )
-        return logits[0, 0].sigmoid(), embedding.float()
+        return logits[0, 0].sigmoid(), embedding
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
         """The photo as a batch of one, at most `max_side` long."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
@@ -29,7 +29,9 @@ class VanillaGS(Method):
         rows["shN"] = torch.zeros(len(points), (cls.sh_degree + 1) ** 2 - 1, 3)
         return cls(Gaussians(rows))
 
-    def encode(self, photo: Float[Tensor, "H W 3"], camera: Camera) -> Appearance:
+    def encode(
+        self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
+    ) -> Appearance:
         """Nothing: this method knows one light only."""
         return Appearance()
 
@@ -41,7 +43,13 @@ class VanillaGS(Method):
         sh = torch.cat([stored["sh0"], stored["shN"]], dim=1)
         return sh if rows is None else sh[rows]
 
-    def training_pass(self, photo: Float[Tensor, "H W 3"], camera: Camera, stage: Stage) -> TrainingOutput:
+    def training_pass(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        stage: Stage,
+        keep: Bool[Tensor, "H W"] | None = None,
+    ) -> TrainingOutput:
         """Renders the camera's view; the photo plays no part."""
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()

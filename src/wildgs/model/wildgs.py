@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
@@ -86,14 +86,16 @@ class WildGS(Method):
     def _lacks(self, part: Ablation) -> bool:
         return part in self.config.without
 
-    def encode(self, photo: Float[Tensor, "H W 3"], camera: Camera) -> Appearance:
+    def encode(
+        self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
+    ) -> Appearance:
         """Parses the photo, lifts its static pixels by the rendered depth, and builds the triplane."""
         appearance = self.parse(photo)
         if self._lacks("local"):
             return appearance
         with torch.no_grad():
             projection = self.gaussians.project(camera)
-        return self.wrap(photo, camera, appearance, projection)
+        return self.wrap(photo, appearance, projection, keep)
 
     def parse(self, photo: Float[Tensor, "H W 3"]) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""
@@ -105,22 +107,24 @@ class WildGS(Method):
     def wrap(
         self,
         photo: Float[Tensor, "H W 3"],
-        camera: Camera,
         appearance: Appearance,
         projection: Projection,
+        keep: Bool[Tensor, "H W"] | None = None,
     ) -> Appearance:
         """3D Wrapping: adds the triplane, from depth that takes no gradient.
 
         Args:
             photo: RGB in [0, 1].
-            camera: Its camera.
             appearance: From `parse`.
-            projection: The Gaussians as `camera` sees them; only geometry is used.
+            projection: The Gaussians as the photo's camera sees them; only geometry is used.
+            keep: The user's own mask: pixels that are False are not lifted.
         """
         with torch.no_grad():
             geometry = blend(projection, None)
-            keep = liftable(appearance.visibility, geometry.alpha, self.config.mask_threshold)
-            points, colors = lift(photo, geometry.depth, keep, camera)
+            chosen = liftable(appearance.visibility, geometry.alpha, self.config.mask_threshold)
+            if keep is not None:
+                chosen = chosen & keep
+            points, colors = lift(photo, geometry.depth, chosen, projection.camera)
         return replace(appearance, planes=self.wrapping.planes(points, colors))
 
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
@@ -145,7 +149,13 @@ class WildGS(Method):
         """Spherical harmonics under an appearance: sample, embed, fuse."""
         return self.fuse(self.embed(appearance, rows), rows)
 
-    def training_pass(self, photo: Float[Tensor, "H W 3"], camera: Camera, stage: Stage) -> TrainingOutput:
+    def training_pass(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        stage: Stage,
+        keep: Bool[Tensor, "H W"] | None = None,
+    ) -> TrainingOutput:
         """The photo is its own reference; one projection serves the depth pass and the colours."""
         appearance = self.parse(photo)
         if not stage.learn_mask and appearance.visibility is not None:
@@ -153,6 +163,6 @@ class WildGS(Method):
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
-            appearance = self.wrap(photo, camera, appearance, projection)
+            appearance = self.wrap(photo, appearance, projection, keep)
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
         return TrainingOutput(blend(projection, colors), projection, appearance.visibility)

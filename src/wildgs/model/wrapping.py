@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from wildgs.model.precision import MixedModule
 from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_planes
 from wildgs.model.unet import UNet
 
@@ -33,7 +34,7 @@ class WrappingConfig:
     box_quantile: float = 0.005
 
 
-class Wrapping(nn.Module):
+class Wrapping(MixedModule):
     """Coloured cloud -> six pictures -> U^3D -> Emb^l per point; the learnable v outside the box."""
 
     low: Tensor
@@ -69,7 +70,8 @@ class Wrapping(nn.Module):
         pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution)
         if not self.reverse:
             pictures = pictures[:, :1]
-        return self.unet(pictures.flatten(1, 2))
+        with self.mixed(points.device):
+            return self.unet(pictures.flatten(1, 2)).float()
 
     def local_embeddings(
         self, planes: Float[Tensor, "3 C R R"] | None, means: Float[Tensor, "N 3"]
@@ -83,6 +85,7 @@ class Wrapping(nn.Module):
             return everywhere
         means = means.detach()
         inside = self.box.contains(means).nonzero()[:, 0]
-        sampled = sample_planes(planes.float(), self.box.normalize(means[inside]))
-        local = self.local_mlp(sampled)
-        return everywhere.to(local.dtype).index_copy(0, inside, local)
+        sampled = sample_planes(planes, self.box.normalize(means[inside]))
+        with self.mixed(means.device):
+            local = self.local_mlp(sampled)
+        return everywhere.index_copy(0, inside, local.float())

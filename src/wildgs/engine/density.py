@@ -1,0 +1,159 @@
+"""Adaptive density control as in 3D Gaussian Splatting (Kerbl et al. 2023, section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wildgs.engine.optimizers import edit_rows, reset_moments
+from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.model.gaussians import Gaussians
+from wildgs.rasterize import Projection
+
+SPLIT_INTO = 2
+SPLIT_SHRINK = 1.6
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Clone, split, prune, reset. Values are 3DGS's.
+
+    Attributes:
+        grow_gradient: Mean screen gradient above which a Gaussian grows, per half picture (3DGS's normalised
+            device coordinates).
+        split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
+        prune_opacity: Fainter Gaussians go.
+        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
+        reset_opacity: Opacities are lowered to this at a reset.
+        max_gaussians: No growth beyond this number.
+    """
+
+    grow_gradient: float = 2e-4
+    split_scale: float = 0.01
+    prune_opacity: float = 0.005
+    prune_scale: float = 0.1
+    reset_opacity: float = 0.01
+    max_gaussians: int = 3_000_000
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one round did, in numbers of Gaussians."""
+
+    cloned: int
+    split: int
+    pruned: int
+
+
+class DensityControl:
+    """Gathers screen statistics and edits the Gaussians."""
+
+    def __init__(self, config: DensityConfig, extent: float, num_gaussians: int) -> None:
+        """Args:
+        config: Thresholds.
+        extent: Radius of the cameras' region, world units.
+        num_gaussians: N now.
+        """
+        self.config = config
+        self.extent = extent
+        self.gradient_sum = torch.zeros(num_gaussians)
+        self.seen = torch.zeros(num_gaussians)
+
+    @torch.no_grad()
+    def gather(self, projection: Projection) -> None:
+        """Adds one view's screen gradients; call after the backward pass."""
+        gradient = projection.means2d.grad
+        if gradient is None:
+            return
+        half = torch.tensor([projection.camera.width / 2, projection.camera.height / 2]).to(gradient)
+        visible = projection.visible
+        norm = (gradient * half).norm(dim=-1)
+        self.gradient_sum = self.gradient_sum.to(norm.device) + torch.where(visible, norm, 0.0)
+        self.seen = self.seen.to(norm.device) + visible
+
+    @torch.no_grad()
+    def densify(
+        self,
+        gaussians: Gaussians,
+        optimizer: torch.optim.Optimizer,
+        generator: torch.Generator,
+        *,
+        prune_large: bool,
+    ) -> DensityReport:
+        """One round: clones and splits where the screen gradient is large, prunes the faint.
+
+        Args:
+            gaussians: Edited in place.
+            optimizer: Edited alike.
+            generator: Draws the split positions.
+            prune_large: Whether oversized Gaussians go as well.
+        """
+        scales = gaussians.scales
+        largest = scales.max(dim=-1).values
+        grows = self._select_growing()
+        clones = grows & (largest <= self.config.split_scale * self.extent)
+        splits = grows & ~clones
+        prune = gaussians.opacities < self.config.prune_opacity
+        if prune_large:
+            prune = prune | (largest > self.config.prune_scale * self.extent)
+        finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)
+        prune = prune | ~finite
+        clones, splits = clones & ~prune, splits & ~prune
+        added = self._cloned(gaussians, clones)
+        halves = self._split(gaussians, splits, generator)
+        added = {name: torch.cat([rows, halves[name]]) for name, rows in added.items()}
+        keep = ~(splits | prune)
+        if not keep.any() and not splits.any():
+            return DensityReport(0, 0, 0)
+        edit_rows(gaussians, optimizer, keep, added)
+        self.gradient_sum = torch.zeros(len(gaussians), device=scales.device)
+        self.seen = torch.zeros(len(gaussians), device=scales.device)
+        return DensityReport(int(clones.sum()), int(splits.sum()), int(prune.sum()))
+
+    def _select_growing(self) -> Bool[Tensor, "N"]:
+        mean = self.gradient_sum / self.seen.clamp_min(1)
+        grows = mean > self.config.grow_gradient
+        room = self.config.max_gaussians - len(mean)
+        if int(grows.sum()) > room:
+            grows = torch.zeros_like(grows)
+            if room > 0:
+                grows[mean.topk(room).indices] = True
+        return grows
+
+    @staticmethod
+    def _cloned(gaussians: Gaussians, which: Bool[Tensor, "N"]) -> dict[str, Tensor]:
+        return {name: rows.detach()[which] for name, rows in gaussians.rows.items()}
+
+    @staticmethod
+    def _split(
+        gaussians: Gaussians, which: Bool[Tensor, "N"], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Two smaller Gaussians drawn from each large one's own distribution."""
+        rows = {
+            name: values.detach()[which].repeat(SPLIT_INTO, *[1] * (values.dim() - 1))
+            for name, values in gaussians.rows.items()
+        }
+        noise = torch.randn(len(rows["means"]), 3, generator=generator).to(rows["means"])
+        offsets = noise * rows["log_scales"].exp()
+        rows["means"] = rows["means"] + torch.einsum("nij,nj->ni", quats_to_rotations(rows["quats"]), offsets)
+        rows["log_scales"] = rows["log_scales"] - torch.tensor(SPLIT_SHRINK).log()
+        return rows
+
+    @torch.no_grad()
+    def reset_opacity(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+        """Lowers all opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned."""
+        ceiling = torch.tensor(self.config.reset_opacity).logit()
+        gaussians.rows["opacity_logits"].clamp_(max=float(ceiling))
+        reset_moments(optimizer, gaussians, "opacity_logits")
+
+
+def scene_extent(centres: Float[Tensor, "V 3"]) -> float:
+    """3DGS's spatial scale: 1.1 times the largest distance of a camera from the cameras' mean.
+
+    One camera alone has no such distance; then 1 (the aligned frame's unit is the median depth).
+    """
+    distance = (centres - centres.mean(dim=0)).norm(dim=-1).max()
+    return float(distance) * 1.1 if len(centres) > 1 and distance > 1e-6 else 1.0

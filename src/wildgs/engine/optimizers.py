@@ -1,0 +1,150 @@
+"""Adam for Gaussians and networks, and row edits that keep its state aligned with the Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor, nn
+
+from wildgs.engine.schedule import exponential
+from wildgs.model.encoder import Encoder
+from wildgs.model.gaussians import Gaussians
+from wildgs.model.method import Method
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Learning rates. Those of the Gaussians are 3DGS's.
+
+    Attributes:
+        means: Position, at the start, per unit of scene extent.
+        means_final: Position, at the end, per unit of scene extent.
+        scales: Logarithms of the scales.
+        quats: Orientations.
+        opacities: Opacity logits.
+        sh0: Flat colour (3dgs only).
+        shN: Higher harmonics (3dgs only).
+        intrinsic: Intrinsic features (wildgs only).
+        networks: All networks but the encoder, at the start.
+        encoder: The encoder, at the start.
+        network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
+    """
+
+    means: float = 1.6e-4
+    means_final: float = 1.6e-6
+    scales: float = 5e-3
+    quats: float = 1e-3
+    opacities: float = 5e-2
+    sh0: float = 2.5e-3
+    shN: float = 1.25e-4  # noqa: N815 - the field's name
+    intrinsic: float = 2.5e-3
+    networks: float = 1e-3
+    encoder: float = 3e-4
+    network_decay: float = 0.1
+
+
+_ROW_RATES = {"log_scales": "scales", "opacity_logits": "opacities"}
+
+
+@dataclass
+class Optimizers:
+    """Adam over the per-Gaussian rows (one group a row) and over the networks.
+
+    Attributes:
+        rows: For `Gaussians.rows`; eps 1e-15 as 3DGS.
+        networks: For everything else, or None where a method has nothing else.
+    """
+
+    config: OptimizerConfig
+    extent: float
+    rows: torch.optim.Adam
+    networks: torch.optim.Adam | None = field(default=None)
+
+    @classmethod
+    def build(cls, method: Method, config: OptimizerConfig, extent: float) -> Optimizers:
+        """Optimisers for a method.
+
+        Args:
+            method: Whose parameters are optimised.
+            config: Learning rates.
+            extent: Radius of the cameras' region, world units (3DGS's spatial learning rate scale).
+        """
+        groups = [
+            {"params": [parameter], "name": name, "lr": _row_rate(config, name, extent)}
+            for name, parameter in method.gaussians.rows.items()
+        ]
+        rows = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        owned = {id(p) for p in method.gaussians.parameters()}
+        encoder = [m for m in method.modules() if isinstance(m, Encoder)]
+        encoder_parameters = [p for m in encoder for p in m.parameters()]
+        owned |= {id(p) for p in encoder_parameters}
+        others = [p for p in method.parameters() if id(p) not in owned]
+        network_groups = [
+            {"params": others, "name": "networks", "lr": config.networks},
+            {"params": encoder_parameters, "name": "encoder", "lr": config.encoder},
+        ]
+        network_groups = [group for group in network_groups if group["params"]]
+        networks = torch.optim.Adam(network_groups, fused=True) if network_groups else None
+        return cls(config, extent, rows, networks)
+
+    def set_progress(self, progress: float) -> None:
+        """Moves every learning rate to where it belongs at a share of the run in [0, 1]."""
+        config = self.config
+        decay = exponential(1.0, config.network_decay, progress)
+        for group in self.rows.param_groups:
+            if group["name"] == "means":
+                group["lr"] = exponential(config.means, config.means_final, progress) * self.extent
+            elif group["name"] == "intrinsic":
+                group["lr"] = config.intrinsic * decay
+        if self.networks is not None:
+            for group in self.networks.param_groups:
+                group["lr"] = getattr(config, group["name"]) * decay
+
+    def step(self) -> None:
+        """One Adam step everywhere, then clears the gradients."""
+        for optimizer in (self.rows, self.networks):
+            if optimizer is not None:
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+
+
+def _row_rate(config: OptimizerConfig, name: str, extent: float) -> float:
+    rate = getattr(config, _ROW_RATES.get(name, name))
+    return rate * extent if name == "means" else rate
+
+
+@torch.no_grad()
+def edit_rows(
+    gaussians: Gaussians, optimizer: torch.optim.Optimizer, keep: Bool[Tensor, "N"], added: dict[str, Tensor]
+) -> None:
+    """Drops and appends Gaussians, in parameters and optimiser state alike.
+
+    Args:
+        gaussians: Edited in place.
+        optimizer: Holds one group a row, named after it.
+        keep: Which present Gaussians stay, in their order.
+        added: New Gaussians' rows, one tensor for every row name; they start with empty Adam moments.
+    """
+    for group in optimizer.param_groups:
+        name = group["name"]
+        old = gaussians.rows[name]
+        new = nn.Parameter(torch.cat([old[keep], added[name].to(old)]))
+        state = optimizer.state.pop(old, {})
+        for key, value in state.items():
+            if isinstance(value, Tensor) and value.shape == old.shape:
+                state[key] = torch.cat([value[keep], torch.zeros_like(added[name], dtype=value.dtype)])
+        if state:
+            optimizer.state[new] = state
+        group["params"] = [new]
+        gaussians.rows[name] = new
+
+
+@torch.no_grad()
+def reset_moments(optimizer: torch.optim.Optimizer, gaussians: Gaussians, name: str) -> None:
+    """Clears the Adam moments of one row (after its values were overwritten)."""
+    state = optimizer.state.get(gaussians.rows[name], {})
+    for key in ("exp_avg", "exp_avg_sq"):
+        if key in state:
+            state[key].zero_()

@@ -1,0 +1,100 @@
+"""What happens when: every schedule of training as a function of the step, nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from wildgs.model.method import Stage
+
+REFERENCE_STEPS = 30_000
+"""The paper's training length; schedules below are stated for it and scale with the run's own length."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """Steps are the paper's, of 30,000; a run of another length scales them (floors keep short runs sane).
+
+    Attributes:
+        first_stage: Steps without triplane and depth loss, until the mask is useful.
+        densify_from: First densification (3DGS: 500).
+        densify_until: Last densification and reset (3DGS: 15,000).
+        densify_every: Between densifications (3DGS: 100).
+        reset_every: Between opacity resets (3DGS: 3,000).
+        mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
+            like a transient.
+        sh_every: Between raises of the active SH degree (3DGS: 1,000).
+    """
+
+    first_stage: int = 3000
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    reset_every: int = 3000
+    mask_pause: int = 500
+    sh_every: int = 1000
+
+
+_FLOORS = {"densify_from": 150, "densify_every": 50, "reset_every": 1000, "mask_pause": 100, "sh_every": 100}
+
+
+class Schedule:
+    """The schedules of one run."""
+
+    def __init__(self, config: ScheduleConfig, steps: int) -> None:
+        """Args:
+        config: In the paper's steps.
+        steps: The run's own length.
+        """
+        self.steps = steps
+        self._factor = steps / REFERENCE_STEPS
+        self.first_stage = self._scaled(config.first_stage, "first_stage")
+        self.densify_from = self._scaled(config.densify_from, "densify_from")
+        self.densify_until = self._scaled(config.densify_until, "densify_until")
+        self.densify_every = self._scaled(config.densify_every, "densify_every")
+        self.reset_every = self._scaled(config.reset_every, "reset_every")
+        self.mask_pause = self._scaled(config.mask_pause, "mask_pause")
+        self.sh_every = self._scaled(config.sh_every, "sh_every")
+
+    def _scaled(self, paper_steps: int, name: str) -> int:
+        scaled = round(paper_steps * self._factor)
+        floor = min(_FLOORS.get(name, 1), paper_steps)
+        return max(scaled, floor)
+
+    def progress(self, step: int) -> float:
+        """Share of the run that lies behind, in [0, 1]."""
+        return min(step / max(self.steps - 1, 1), 1.0)
+
+    def stage(self, step: int, sh_degree: int) -> Stage:
+        """What the method's forward pass does at a step.
+
+        Args:
+            step: From 0.
+            sh_degree: The method's full degree.
+        """
+        return Stage(
+            explicit=step >= self.first_stage,
+            learn_mask=not self.mask_paused(step),
+            sh_degree=min(step // self.sh_every, sh_degree),
+        )
+
+    def mask_paused(self, step: int) -> bool:
+        """Whether an opacity reset lies less than `mask_pause` steps back."""
+        last = min(step, self.densify_until) // self.reset_every * self.reset_every
+        return last > 0 and step - last < self.mask_pause
+
+    def densifies(self, step: int) -> bool:
+        """Whether the Gaussians are densified after this step."""
+        return self.densify_from < step < self.densify_until and step % self.densify_every == 0
+
+    def resets(self, step: int) -> bool:
+        """Whether opacities are reset after this step."""
+        return 0 < step < self.densify_until and step % self.reset_every == 0
+
+    def gathers(self, step: int) -> bool:
+        """Whether screen statistics are still needed."""
+        return step < self.densify_until
+
+
+def exponential(start: float, end: float, progress: float) -> float:
+    """From `start` to `end` on a straight line of logarithms (3DGS's position learning rate)."""
+    return start ** (1 - progress) * end**progress

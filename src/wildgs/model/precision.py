@@ -1,0 +1,42 @@
+"""Mixed precision for the networks alone; geometry and rasterisation always run in float32."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Literal
+
+import torch
+from torch import nn
+
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+class MixedModule(nn.Module):
+    """A network whose forward pass may run in bfloat16."""
+
+    precision: torch.dtype = torch.float32
+
+    def mixed(self, device: torch.device) -> AbstractContextManager[object]:
+        """Autocast to this module's precision."""
+        enabled = self.precision != torch.float32
+        return torch.autocast(device.type, dtype=self.precision if enabled else None, enabled=enabled)
+
+
+def set_precision(module: nn.Module, precision: torch.dtype) -> None:
+    """Sets the precision of all networks inside a module."""
+    for part in module.modules():
+        if isinstance(part, MixedModule):
+            part.precision = precision
+
+
+def choose_precision(wish: Precision, device: torch.device) -> torch.dtype:
+    """The dtype for a wish: 'auto' takes bfloat16 where the hardware multiplies it fast.
+
+    On CPUs that is AVX-512 BF16 or AMX; without them bfloat16 is emulated and slower than float32.
+    """
+    if wish != "auto":
+        return torch.bfloat16 if wish == "bfloat16" else torch.float32
+    if device.type == "cuda":
+        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+    probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return torch.bfloat16 if probe is not None and probe() else torch.float32
