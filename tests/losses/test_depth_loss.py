@@ -13,7 +13,7 @@ EVERYWHERE = torch.ones(H, W, dtype=torch.bool)
 
 
 def plane() -> tuple[torch.Tensor, torch.Tensor]:
-    """Depth of a ground plane 1.5 m under a camera that looks slightly down, and its disparity (1 / depth)."""
+    """Depth of a ground plane 1.5 m under a camera that looks down at it, and its disparity (1 / depth)."""
     K = torch.tensor([[40.0, 0, W / 2], [0, 40.0, H / 2], [0, 0, 1]])
     rays = Camera(torch.eye(4), K, W, H).pixel_rays()
     pitch = math.radians(35)
@@ -36,10 +36,8 @@ def test_right_depth_of_a_plane_costs_little_and_inverted_depth_costs_two():
 
 def test_descent_turns_a_flat_guess_into_the_plane():
     depth, disparity = plane()
-    guess = (
-        torch.full((H, W), 3.0) + 0.01 * torch.rand(H, W, generator=torch.Generator().manual_seed(0))
-    ).clone()
-    guess.requires_grad_()
+    noise = torch.rand(H, W, generator=torch.Generator().manual_seed(0))
+    guess = (3 + 0.01 * noise).requires_grad_()
     optimizer = torch.optim.Adam([guess], lr=0.01)
     for _ in range(150):
         optimizer.zero_grad()

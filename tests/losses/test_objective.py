@@ -29,7 +29,7 @@ def test_regularizer_is_the_mean_square_of_what_is_hidden():
 
 def test_mask_weight_falls_linearly_and_stays_in_its_range():
     config = ObjectiveConfig()
-    weights = [config.mask_weight(p) for p in (-1, 0, 0.5, 1, 2)]
+    weights = [config.mask_weight(p) for p in (-1.0, 0.0, 0.5, 1.0, 2.0)]
     assert weights == pytest.approx([0.4, 0.4, 0.25, 0.1, 0.1])
 
 

@@ -34,11 +34,11 @@ def _filter_row(padded, taps, channels, out):
 
 
 @njit(parallel=True, fastmath=_MATHS, error_model="numpy", cache=True)
-def ssim_forward(x, y, taps, c1, c2, channels, d_mean_x, d_mean_y, d_square, d_cross, row_sums):
+def ssim_forward(x, y, taps, c1, c2, channels, derivatives, row_sums):
     """Sum the SSIM map per row and keep its derivatives by the window's moments.
 
-    With E the window's weighted mean, writes d ssim / d E[x], d E[y], d E[x^2] (the same as d E[y^2]) and
-    d E[xy], each [H, L].
+    With E the window's weighted mean, `derivatives` [4, H, L] takes those of ssim by E[x], E[y], E[x^2] (the
+    same as by E[y^2]) and E[xy].
     """
     height, length = x.shape
     pad = RADIUS * channels
@@ -59,7 +59,8 @@ def ssim_forward(x, y, taps, c1, c2, channels, d_mean_x, d_mean_y, d_square, d_c
         for k in range(5):
             _filter_row(sums[k], taps, channels, means[k])
         mx, my, mxx, myy, mxy = means[0], means[1], means[2], means[3], means[4]
-        out_x, out_y, out_s, out_c = d_mean_x[i], d_mean_y[i], d_square[i], d_cross[i]
+        by_x, by_y = derivatives[0, i], derivatives[1, i]
+        by_square, by_cross = derivatives[2, i], derivatives[3, i]
         total = x.dtype.type(0)
         for j in range(length):
             p, q = mx[j], my[j]
@@ -72,15 +73,15 @@ def ssim_forward(x, y, taps, c1, c2, channels, d_mean_x, d_mean_y, d_square, d_c
             total += value
             by_b, by_d = a * inverse, -value * c * inverse
             by_a, by_c = b * inverse - by_b, -value * d * inverse - by_d
-            out_x[j] = 2 * (q * by_a + p * by_c)
-            out_y[j] = 2 * (p * by_a + q * by_c)
-            out_s[j] = by_d
-            out_c[j] = 2 * by_b
+            by_x[j] = 2 * (q * by_a + p * by_c)
+            by_y[j] = 2 * (p * by_a + q * by_c)
+            by_square[j] = by_d
+            by_cross[j] = 2 * by_b
         row_sums[i] = total
 
 
 @njit(parallel=True, fastmath=_MATHS, error_model="numpy", cache=True)
-def ssim_backward(x, y, taps, scale, channels, d_mean_x, d_mean_y, d_square, d_cross, grad_x, grad_y):
+def ssim_backward(x, y, taps, scale, channels, derivatives, grad_x, grad_y):
     """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept.
 
     The window is symmetric, so the adjoint of filtering with zero padding is the same filtering.
@@ -93,7 +94,8 @@ def ssim_backward(x, y, taps, scale, channels, d_mean_x, d_mean_y, d_square, d_c
         s2, s3 = sums[2, pad : pad + length], sums[3, pad : pad + length]
         for k in range(max(0, RADIUS - i), min(2 * RADIUS + 1, height + RADIUS - i)):
             r = i + k - RADIUS
-            w, p0, p1, p2, p3 = scale * taps[k], d_mean_x[r], d_mean_y[r], d_square[r], d_cross[r]
+            w = scale * taps[k]
+            p0, p1, p2, p3 = derivatives[0, r], derivatives[1, r], derivatives[2, r], derivatives[3, r]
             for j in range(length):
                 s0[j] += w * p0[j]
                 s1[j] += w * p1[j]
