@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -108,6 +109,31 @@ class Optimizers:
             if optimizer is not None:
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
+
+    def state(self) -> dict[str, Tensor]:
+        """Adam's moments and step counts, as flat tensors."""
+        return {
+            f"{kind}.{index}.{key}": value
+            for kind, index, parameter, optimizer in self._parameters()
+            for key, value in optimizer.state.get(parameter, {}).items()
+        }
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Puts back what `state` gave, for the same method with the same rows."""
+        for kind, index, parameter, optimizer in self._parameters():
+            prefix = f"{kind}.{index}."
+            found = {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
+            if found:
+                optimizer.state[parameter] = {
+                    key: value.to(parameter.device) for key, value in found.items()
+                }
+
+    def _parameters(self) -> Iterator[tuple[str, int, Tensor, torch.optim.Adam]]:
+        for kind, optimizer in (("rows", self.rows), ("networks", self.networks)):
+            if optimizer is not None:
+                parameters = [p for group in optimizer.param_groups for p in group["params"]]
+                for index, parameter in enumerate(parameters):
+                    yield kind, index, parameter, optimizer
 
 
 def _row_rate(config: OptimizerConfig, name: str, extent: float) -> float:

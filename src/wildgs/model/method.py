@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -46,10 +47,22 @@ class TrainingOutput:
 
 
 class Method(nn.Module, ABC):
-    """A set of Gaussians and a way to colour them."""
+    """A set of Gaussians and a way to colour them.
+
+    Attributes:
+        gaussians: The Gaussians.
+        sh_degree: Degree of the spherical harmonics that `shade` gives.
+        mask_threshold: Th: pixels with a visibility above it count as static.
+        depth_supervised: Whether the depth loss applies to this method.
+    """
 
     gaussians: Gaussians
     sh_degree: int = 3
+    mask_threshold: float = 0.5
+    depth_supervised: bool = False
+
+    def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
+        """Looks at some training photos (RGB in [0, 1]) once, before the first step."""
 
     @property
     def num_gaussians(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from wildgs.model.encoder import FEATURE_WIDTHS, RESNET18, Encoder, load_encoder
 from wildgs.model.precision import MixedModule
 from wildgs.model.unet import UpBlock
 
+CALIBRATION_SIDE = 224
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
 
@@ -78,6 +80,15 @@ class Parsing(MixedModule):
             coarse.float(), size=photo.shape[:2], mode="bilinear", align_corners=False
         )
         return logits[0, 0].sigmoid(), embedding
+
+    def calibrate(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
+        """Sets a fresh encoder's normalisation statistics from photos; does nothing to a pretrained one."""
+        side = min(self.config.max_side, CALIBRATION_SIDE)
+        squares = [
+            functional.interpolate(photo.permute(2, 0, 1)[None], size=(side, side), mode="bilinear")
+            for photo in photos
+        ]
+        self.encoder.calibrate(torch.cat(squares))
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
         """The photo as a batch of one, at most `max_side` long."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -30,7 +31,7 @@ class WildGSConfig:
     """The model.
 
     Attributes:
-        without: Parts left out, for ablations ('depth' is the trainer's affair and changes nothing here).
+        without: Parts left out, for ablations.
         mask_threshold: Th: pixels above it are static (lifting, depth loss).
         parsing: 2D Parsing.
         wrapping: 3D Wrapping.
@@ -60,6 +61,8 @@ class WildGS(Method):
         self.config = config
         self.gaussians = gaussians
         self.sh_degree = config.fusion.sh_degree
+        self.mask_threshold = config.mask_threshold
+        self.depth_supervised = not self._lacks("depth")
         self.parsing = Parsing(config.parsing, encoder)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
@@ -85,6 +88,10 @@ class WildGS(Method):
 
     def _lacks(self, part: Ablation) -> bool:
         return part in self.config.without
+
+    def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
+        """Gives a fresh encoder its normalisation statistics."""
+        self.parsing.calibrate(photos)
 
     def encode(
         self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
@@ -121,7 +128,7 @@ class WildGS(Method):
         """
         with torch.no_grad():
             geometry = blend(projection, None)
-            chosen = liftable(appearance.visibility, geometry.alpha, self.config.mask_threshold)
+            chosen = liftable(appearance.visibility, geometry.alpha, self.mask_threshold)
             if keep is not None:
                 chosen = chosen & keep
             points, colors = lift(photo, geometry.depth, chosen, projection.camera)

@@ -1,0 +1,79 @@
+"""What a run leaves on disk while it trains: metrics.jsonl and tensorboard."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import TracebackType
+
+import torch
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from wildgs.engine.trainer import StepReport
+
+
+class Recorder:
+    """An observer of training; a context manager that closes its files."""
+
+    def __init__(self, folder: Path, *, scalars_every: int = 50, pictures_every: int = 500) -> None:
+        """Args:
+        folder: The run folder.
+        scalars_every: Steps between log entries.
+        pictures_every: Steps between pictures on tensorboard.
+        """
+        self.scalars_every = scalars_every
+        self.pictures_every = pictures_every
+        folder.mkdir(parents=True, exist_ok=True)
+        self._lines = (folder / "metrics.jsonl").open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(folder / "tensorboard"))
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._lines.close()
+        self._board.close()
+
+    def __call__(self, report: StepReport) -> None:
+        """Records a step, if it is one to be recorded."""
+        if report.step % self.scalars_every == 0:
+            self._record_scalars(report)
+        if report.step % self.pictures_every == 0:
+            self._record_pictures(report)
+
+    def _record_scalars(self, report: StepReport) -> None:
+        values = report.losses.as_floats()
+        values["num_gaussians"] = report.num_gaussians
+        values["steps_per_second"] = report.step / max(report.seconds, 1e-9)
+        if report.output.visibility is not None:
+            values["visibility"] = float(report.output.visibility.detach().mean())
+        for name, value in values.items():
+            self._board.add_scalar(f"train/{name}", value, report.step)
+        line = {"step": report.step, "seconds": round(report.seconds, 3), "view": report.view.name, **values}
+        self._lines.write(json.dumps(line) + "\n")
+        self._lines.flush()
+
+    def _record_pictures(self, report: StepReport) -> None:
+        rendering = report.output.rendering
+        pictures = {
+            "photo": report.view.read_photo().float() / 255,
+            "render": rendering.colors.detach().clamp(0, 1),
+            "depth": _grey(rendering.depth.detach()),
+        }
+        if report.output.visibility is not None:
+            pictures["visibility"] = report.output.visibility.detach()[..., None]
+        for name, picture in pictures.items():
+            self._board.add_image(f"train/{name}", picture, report.step, dataformats="HWC")
+
+
+def _grey(depth: Tensor) -> Tensor:
+    """Inverse depth, stretched to [0, 1]: near is bright, empty is black."""
+    disparity = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
+    limit = disparity[disparity > 0].quantile(0.98) if bool((disparity > 0).any()) else disparity.new_tensor(1)
+    return (disparity / limit).clamp(0, 1)[..., None]

@@ -1,0 +1,33 @@
+"""The order in which photos train: shuffled, every photo once a round."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class ViewSampler:
+    """Endless shuffled rounds over `count` views, with a state that can be saved."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        self.count = count
+        self._generator = generator
+        self.order = torch.empty(0, dtype=torch.int64)
+        self.position = 0
+
+    def next(self) -> int:
+        """The next view's index."""
+        if self.position >= len(self.order):
+            self.order = torch.randperm(self.count, generator=self._generator)
+            self.position = 0
+        self.position += 1
+        return int(self.order[self.position - 1])
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs."""
+        return {"order": self.order.clone(), "position": torch.tensor(self.position)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Goes on where `state` was taken."""
+        self.order = state["order"]
+        self.position = int(state["position"])

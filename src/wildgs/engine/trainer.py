@@ -1,0 +1,193 @@
+"""The training loop. It knows no screen and no file: observers watch it, and `state` is all there is to save."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from wildgs.data import View
+from wildgs.engine.density import DensityConfig, DensityControl, DensityReport, scene_extent
+from wildgs.engine.optimizers import OptimizerConfig, Optimizers
+from wildgs.engine.sampler import ViewSampler
+from wildgs.engine.schedule import Schedule, ScheduleConfig
+from wildgs.errors import UserError
+from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
+from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.precision import Precision, choose_precision, set_precision
+
+PREPARATION_PHOTOS = 16
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Training.
+
+    Attributes:
+        steps: How long (paper: 30,000; '†': 15,000).
+        seed: Of everything random.
+        precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
+        objective: Loss weights.
+        schedule: What happens when.
+        optimizer: Learning rates.
+        density: Densification and pruning.
+    """
+
+    steps: int = 30_000
+    seed: int = 0
+    precision: Precision = "auto"
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What an observer gets after every step.
+
+    Attributes:
+        step: Number of steps done, from 1.
+        view: The photo that trained.
+        losses: Every term; tensors, so that nothing waits for the device unless read.
+        output: The forward pass.
+        num_gaussians: N after the step.
+        density: What densification did, where it ran.
+        seconds: Training time so far, without what observers take.
+    """
+
+    step: int
+    view: View
+    losses: Losses
+    output: TrainingOutput
+    num_gaussians: int
+    density: DensityReport | None
+    seconds: float
+
+
+Observer = Callable[[StepReport], None]
+
+
+class Trainer:
+    """Trains a method on views."""
+
+    def __init__(self, method: Method, views: Sequence[View], config: TrainConfig) -> None:
+        """Args:
+        method: Trained in place, on the device on which its parameters are.
+        views: The training photos.
+        config: How.
+
+        Raises:
+            UserError: There is no photo to train on.
+        """
+        if not views:
+            raise UserError("no photo to train on: the split leaves none with a camera")
+        self.method = method
+        self.views = list(views)
+        self.config = config
+        self.device = method.gaussians.means.device
+        self.step = 0
+        self.seconds = 0.0
+        self.schedule = Schedule(config.schedule, config.steps)
+        self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
+        extent = scene_extent(torch.stack([view.camera.position for view in views]))
+        self.optimizers = Optimizers.build(method, config.optimizer, extent)
+        self.density = DensityControl(config.density, extent, len(method.gaussians))
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.sampler = ViewSampler(len(views), self.generator)
+
+    def run(self, observers: Sequence[Observer] = ()) -> None:
+        """Trains until `config.steps`; every observer is called after every step."""
+        if self.step == 0:
+            self._prepare()
+        set_precision(self.method, choose_precision(self.config.precision, self.device))
+        try:
+            while self.step < self.config.steps:
+                report = self._advance()
+                for observer in observers:
+                    observer(report)
+        finally:
+            set_precision(self.method, torch.float32)
+
+    def _advance(self) -> StepReport:
+        start = time.perf_counter()
+        view = self.views[self.sampler.next()]
+        self.optimizers.set_progress(self.schedule.progress(self.step))
+        output, losses = self._forward(view)
+        losses.total.backward()
+        if self.schedule.gathers(self.step):
+            self.density.gather(output.projection)
+        self.optimizers.step()
+        self.step += 1
+        density = self._control_density()
+        self.seconds += time.perf_counter() - start
+        return StepReport(
+            self.step, view, losses, output, len(self.method.gaussians), density, self.seconds
+        )
+
+    def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
+        photo = view.read_photo().to(self.device).float() / 255
+        mask = view.read_mask()
+        keep = None if mask is None else mask.to(self.device) > 0
+        stage = self.schedule.stage(self.step, self.method.sh_degree)
+        output = self.method.training_pass(photo, view.camera.to(self.device), stage, keep)
+        disparity = view.read_disparity() if self.method.depth_supervised and stage.explicit else None
+        losses = total_loss(
+            self._objective,
+            self.schedule.progress(self.step),
+            photo,
+            output.rendering.colors,
+            visibility=output.visibility,
+            keep=keep,
+            depth=output.rendering.depth,
+            alpha=output.rendering.alpha,
+            disparity=None if disparity is None else disparity.to(self.device),
+            train_mask=stage.learn_mask,
+        )
+        return output, losses
+
+    def _control_density(self) -> DensityReport | None:
+        report = None
+        if self.schedule.densifies(self.step):
+            large = self.step > self.schedule.reset_every
+            report = self.density.densify(
+                self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
+            )
+        if self.schedule.resets(self.step):
+            self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
+        return report
+
+    def _prepare(self) -> None:
+        """Shows the method a few photos, spread over the collection."""
+        stride = max(1, len(self.views) // PREPARATION_PHOTOS)
+        chosen = self.views[::stride][:PREPARATION_PHOTOS]
+        self.method.prepare([view.read_photo().to(self.device).float() / 255 for view in chosen])
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that training needs to go on exactly, as flat tensors."""
+        state = {f"method.{name}": value for name, value in self.method.state_dict().items()}
+        state |= {f"optimizer.{name}": value for name, value in self.optimizers.state().items()}
+        state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
+        state["density.gradient_sum"] = self.density.gradient_sum
+        state["density.seen"] = self.density.seen
+        state["random.generator"] = self.generator.get_state()
+        state["progress.step"] = torch.tensor(self.step)
+        state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
+        return state
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Goes on from `state`; the method must have been restored from the same checkpoint already."""
+        self.optimizers.restore(_under(state, "optimizer."))
+        self.sampler.restore(_under(state, "sampler."))
+        self.density.gradient_sum = state["density.gradient_sum"].to(self.device)
+        self.density.seen = state["density.seen"].to(self.device)
+        self.generator.set_state(state["random.generator"])
+        self.step = int(state["progress.step"])
+        self.seconds = float(state["progress.seconds"])
+
+
+def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
