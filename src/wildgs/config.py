@@ -1,0 +1,116 @@
+"""A run's whole configuration: the rooms' own dataclasses in one, readable and writable as YAML."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from wildgs.data import DataConfig
+from wildgs.engine.trainer import TrainConfig
+from wildgs.errors import UserError
+from wildgs.model.registry import MethodName
+from wildgs.model.wildgs import WildGSConfig
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run's outcome.
+
+    Attributes:
+        scene: The scene folder.
+        method: `wildgs`, or `3dgs` for the paper's baseline.
+        data: How the scene is read.
+        model: Wild-GS; without effect on `3dgs`.
+        train: Training.
+    """
+
+    scene: Path
+    method: MethodName = "wildgs"
+    data: DataConfig = field(default_factory=DataConfig)
+    model: WildGSConfig = field(default_factory=WildGSConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+def to_plain(value: Any) -> Any:
+    """A configuration as dicts, lists, strings and numbers."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, (tuple, list)):
+        return [to_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
+    """The inverse of `to_plain`; missing entries take their defaults.
+
+    Args:
+        kind: The type to make.
+        value: Plain data, for example from YAML.
+        where: Named in errors.
+
+    Raises:
+        UserError: An entry is unknown or of the wrong type.
+    """
+    if dataclasses.is_dataclass(kind):
+        return _dataclass_from_plain(kind, value, where)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal and value in arguments:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        return _union_from_plain(arguments, value, where)
+    if origin is tuple and isinstance(value, list):
+        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(inner) == len(value):
+            return tuple(from_plain(k, v, where) for k, v in zip(inner, value, strict=True))
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(kind, type) and type(value) is kind:
+        return value
+    raise UserError(f"{where}: {value!r} is not a {getattr(kind, '__name__', kind)}")
+
+
+def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, dict):
+        raise UserError(f"{where}: expected a mapping, found {value!r}")
+    hints = typing.get_type_hints(kind)
+    known = {f.name for f in dataclasses.fields(kind)}
+    if unknown := sorted(set(value) - known):
+        raise UserError(f"{where}: unknown entry {unknown[0]!r}; known are {', '.join(sorted(known))}")
+    return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
+
+
+def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
+    if value is None and type(None) in kinds:
+        return None
+    for kind in kinds:
+        try:
+            return from_plain(kind, value, where)
+        except UserError:
+            continue
+    raise UserError(f"{where}: {value!r} fits none of {kinds}")
+
+
+def write_config(path: Path, config: RunConfig) -> None:
+    """Writes YAML."""
+    path.write_text(yaml.safe_dump(to_plain(config), sort_keys=False), encoding="utf-8")
+
+
+def read_config(path: Path) -> RunConfig:
+    """Reads YAML.
+
+    Raises:
+        UserError: The file is missing, no YAML, or no run configuration.
+    """
+    try:
+        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
+    return from_plain(RunConfig, plain, str(path))
