@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -20,11 +21,57 @@ class Alignment:
     """The rigid motion and scale from the input's (COLMAP's) frame to the scene's aligned frame.
 
     ``aligned = scale * rotation @ input + translation``. Kept with the run so that exports can go back.
+    Double precision, because georeferenced input lies far from its origin.
     """
 
     rotation: Float[Tensor, "3 3"]
     translation: Float[Tensor, "3"]
     scale: float = 1.0
+
+    @classmethod
+    def identity(cls) -> Alignment:
+        """The alignment that changes nothing."""
+        return cls(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+    def inverse(self) -> Alignment:
+        """From the aligned frame back to the input's."""
+        back = self.rotation.T
+        return Alignment(back, -(back @ self.translation) / self.scale, 1.0 / self.scale)
+
+    def apply_points(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Points carried from the input's frame to the aligned one, in the dtype in which they came."""
+        rotation, translation = self.rotation.to(points.device), self.translation.to(points.device)
+        moved = self.scale * points.to(rotation) @ rotation.T + translation
+        return moved.to(points.dtype)
+
+    def apply_camera(self, camera: Camera) -> Camera:
+        """The camera that sees the aligned world as `camera` sees the input's.
+
+        Camera space is scaled too (depths are `scale` times as large); the picture does not change.
+        """
+        device = camera.viewmat.device
+        rotation, translation = self.rotation.to(device), self.translation.to(device)
+        viewmat = camera.viewmat.to(rotation).clone()
+        viewmat[:3, :3] = viewmat[:3, :3] @ rotation.T
+        viewmat[:3, 3] = self.scale * viewmat[:3, 3] - viewmat[:3, :3] @ translation
+        return replace(camera, viewmat=viewmat.to(camera.viewmat.dtype))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON or YAML; `from_dict` reads them back without loss."""
+        return {
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+            "scale": float(self.scale),
+        }
+
+    @classmethod
+    def from_dict(cls, numbers: Mapping[str, Any]) -> Alignment:
+        """The alignment that `to_dict` wrote."""
+        return cls(
+            rotation=torch.tensor(numbers["rotation"], dtype=torch.float64),
+            translation=torch.tensor(numbers["translation"], dtype=torch.float64),
+            scale=float(numbers["scale"]),
+        )
 
 
 @dataclass(frozen=True)
@@ -78,3 +125,21 @@ class Scene:
     def test_views(self) -> tuple[View, ...]:
         """The photos that are held out, in name order."""
         return tuple(v for v in self.views if v.split == "test")
+
+
+def scene_extent(scene: Scene) -> float:
+    """The radius of the cameras that train, in world units: by which 3DGS scales steps and splits.
+
+    1.1 times the largest distance of a camera from the cameras' mean, as in 3DGS. Cameras that share one
+    place say nothing about the scene's size; then the median distance of the points from them counts.
+
+    Raises:
+        ValueError: The scene has no view that trains.
+    """
+    if not scene.train_views:
+        raise ValueError("a scene without training views has no extent")
+    positions = torch.stack([view.camera.position for view in scene.train_views])
+    centre = positions.mean(dim=0)
+    radius = float((positions - centre).norm(dim=-1).max())
+    distance = float((scene.points - centre).norm(dim=-1).median()) if len(scene.points) else 1.0
+    return 1.1 * (radius if radius > 1e-3 * distance else distance)

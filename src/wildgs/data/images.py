@@ -1,0 +1,219 @@
+"""Pictures from disk as 8-bit arrays: any mode, any orientation, any broken file named.
+
+Colours stay in the photo's own encoding (sRGB as a rule), as every photo collection of the field uses them.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped, UInt8, UInt16
+from PIL import Image, ImageOps
+
+EXIF_ORIENTATION = 0x0112
+ASPECT_TOLERANCE = 0.01
+"""Sizes have the same shape when their aspects differ by less than this share (or a pixel's rounding)."""
+
+MAX_IMAGE_PIXELS = 250_000_000
+"""Pictures with more pixels are refused unread: a small file can unpack to more than the memory holds."""
+
+_open_lock = threading.Lock()
+
+
+class UnreadableImageError(Exception):
+    """A picture that cannot be used; the message says why, without the file's name."""
+
+
+class ShapeMismatchError(UnreadableImageError):
+    """A picture whose shape is not its camera's: the scene is put together wrongly, the file is sound."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A decoded photo.
+
+    Attributes:
+        pixels: Colours; black where the photo is fully transparent.
+        opaque: 255 where the photo shows something, 0 where its alpha is 0; None for a photo without alpha.
+    """
+
+    pixels: UInt8[np.ndarray, "H W 3"]
+    opaque: UInt8[np.ndarray, "H W"] | None
+
+
+def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
+    """Open a picture and read its header only.
+
+    Raises:
+        UnreadableImageError: It is missing, no picture, or has more pixels than `max_pixels`.
+    """
+    try:
+        # Pillow's own limit is a global of the process, and warns; ours is an argument.
+        with _open_lock:
+            previous, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                image = Image.open(path)
+            finally:
+                Image.MAX_IMAGE_PIXELS = previous
+    except FileNotFoundError as error:
+        raise UnreadableImageError("no such file") from error
+    except Exception as error:  # Pillow's plugins raise nearly anything on broken headers
+        raise UnreadableImageError("not a readable picture") from error
+    width, height = image.size
+    if width * height > max_pixels:
+        image.close()
+        raise UnreadableImageError(f"{width}x{height} pixels exceed the limit of {max_pixels}")
+    return image
+
+
+def _load(image: Image.Image) -> None:
+    try:
+        image.load()
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UnreadableImageError(reason) from error
+
+
+def upright_size(image: Image.Image) -> tuple[int, int]:
+    """Width and height once the EXIF orientation is applied, from the header alone."""
+    width, height = image.size
+    return (height, width) if _orientation(image) in (5, 6, 7, 8) else (width, height)
+
+
+def _orientation(image: Image.Image) -> int:
+    try:
+        return int(image.getexif().get(EXIF_ORIENTATION, 1))
+    except Exception:  # a broken EXIF block does not make the pixels worse
+        return 1
+
+
+def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) are the same picture at other resolutions."""
+    scale_x, scale_y = a[0] / b[0], a[1] / b[1]
+    tolerance = max(ASPECT_TOLERANCE, 1.0 / min(*a, *b))
+    return abs(scale_x / scale_y - 1.0) <= tolerance
+
+
+def read_photo(
+    path: Path,
+    *,
+    camera_size: tuple[int, int] | None = None,
+    size: tuple[int, int] | None = None,
+    max_pixels: int = MAX_IMAGE_PIXELS,
+) -> Photo:
+    """Decode a photo to 8-bit RGB.
+
+    COLMAP reads pixels as they are stored and ignores the EXIF orientation, so with `camera_size` the stored
+    grid counts, unless only the upright one has the camera's shape. Without it the photo is turned upright.
+
+    Args:
+        path: The file: RGB, grey, CMYK, palette, alpha, 8 or 16 bits.
+        camera_size: Width and height of the photo's camera.
+        size: Width and height to resize to (Lanczos, antialiased); None keeps the size.
+        max_pixels: Larger pictures are refused.
+
+    Raises:
+        UnreadableImageError: The file cannot be decoded, or has another shape than its camera.
+    """
+    with open_image(path, max_pixels) as image:
+        turn = _orientation(image) != 1
+        if camera_size is not None:
+            if same_shape(image.size, camera_size):
+                turn = False
+            elif not (turn and same_shape(upright_size(image), camera_size)):
+                raise ShapeMismatchError(
+                    f"{_times(image.size)} pixels, but its camera is {_times(camera_size)}"
+                )
+        _load(image)
+        upright = ImageOps.exif_transpose(image) if turn else image
+        colours, alpha = _to_rgb(upright)
+        return Photo(
+            pixels=np.array(_resize(colours, size, Image.Resampling.LANCZOS)),
+            opaque=None if alpha is None else _resize_mask(alpha, size),
+        )
+
+
+def read_mask(
+    path: Path, size: tuple[int, int], max_pixels: int = MAX_IMAGE_PIXELS
+) -> UInt8[np.ndarray, "H W"]:
+    """Decode a mask: 0 where the file is black (ignored), 255 elsewhere; by majority where it is shrunk.
+
+    Raises:
+        UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
+    """
+    with open_image(path, max_pixels) as image:
+        _check_shape(image, size)
+        _load(image)
+        grey = image if _is_deep(image) else image.convert("L")
+        return _resize_mask(np.asarray(grey) != 0, size)
+
+
+def read_disparity(
+    path: Path, size: tuple[int, int], max_pixels: int = MAX_IMAGE_PIXELS
+) -> UInt16[np.ndarray, "H W"]:
+    """Decode a disparity map (large = near, 0 = no estimate) to 16 bits; 8-bit files are stretched.
+
+    Zeros are no values: they take no part in the mean of the pixels that a smaller pixel covers.
+
+    Raises:
+        UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
+    """
+    with open_image(path, max_pixels) as image:
+        _check_shape(image, size)
+        _load(image)
+        values = np.asarray(image if _is_deep(image) else image.convert("L")).astype(np.float32)
+        if not _is_deep(image):
+            values *= 257.0
+    if (values.shape[1], values.shape[0]) != size:
+        valid = (values > 0).astype(np.float32)
+        share = np.asarray(Image.fromarray(valid).resize(size, Image.Resampling.BOX))
+        total = np.asarray(Image.fromarray(values * valid).resize(size, Image.Resampling.BOX))
+        values = np.where(share >= 0.5, np.maximum(total / np.maximum(share, 0.5), 1.0), 0.0)
+    return np.clip(np.round(values), 0, 65535).astype(np.uint16)
+
+
+def _check_shape(image: Image.Image, size: tuple[int, int]) -> None:
+    if not same_shape(image.size, size):
+        raise ShapeMismatchError(
+            f"{_times(image.size)} pixels do not have the shape of the photo, {_times(size)}"
+        )
+
+
+def _times(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _is_deep(image: Image.Image) -> bool:
+    return image.mode in ("I", "F") or image.mode.startswith("I;16")
+
+
+def _to_rgb(image: Image.Image) -> tuple[Image.Image, UInt8[np.ndarray, "H W"] | None]:
+    """Colours, black under full transparency, and the alpha channel if the picture has one."""
+    if _is_deep(image):
+        return Image.fromarray(_to_8_bits(np.asarray(image))).convert("RGB"), None
+    has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+    if not has_alpha:
+        return image.convert("RGB"), None
+    rgba = image.convert("RGBA")
+    black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+    return Image.alpha_composite(black, rgba).convert("RGB"), np.array(rgba.getchannel("A"))
+
+
+def _to_8_bits(values: Shaped[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """Grey of more than 8 bits: 16-bit integers, or floats in [0, 1]."""
+    full = 1.0 if values.dtype.kind == "f" else 65535.0
+    return np.clip(np.round(values.astype(np.float64) * (255.0 / full)), 0, 255).astype(np.uint8)
+
+
+def _resize(image: Image.Image, size: tuple[int, int] | None, resampling: Image.Resampling) -> Image.Image:
+    return image if size is None or image.size == size else image.resize(size, resampling)
+
+
+def _resize_mask(mask: Shaped[np.ndarray, "h w"], size: tuple[int, int] | None) -> UInt8[np.ndarray, "H W"]:
+    """0 or 255 per pixel of the new size, by the majority of the pixels beneath."""
+    binary = Image.fromarray(np.where(mask != 0, 255, 0).astype(np.uint8))
+    resized = np.asarray(_resize(binary, size, Image.Resampling.BOX))
+    return np.where(resized >= 128, 255, 0).astype(np.uint8)

@@ -1,0 +1,157 @@
+"""`load_scene`: a scene folder becomes views with cameras in the aligned frame."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from wildgs.data.alignment import align_world
+from wildgs.data.colmap import ColmapImage, describe_names, read_model
+from wildgs.data.images import MAX_IMAGE_PIXELS, UnreadableImageError
+from wildgs.data.phototourism import assign_splits
+from wildgs.data.pictures import PhotoFiles
+from wildgs.data.scene import Alignment, Scene, Split, View
+from wildgs.data.undistort import PixelGrid
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.geometry.camera import Camera
+
+DECODERS = 4
+"""Threads that decode photos; Pillow works without Python's lock."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """How a scene folder is read."""
+
+    downscale: int | float = 1
+    """Divides the photos' width and height (the paper: 2 on Phototourism)."""
+    holdout: int = 8
+    """Every n-th photo tests where the scene has no .tsv split; 0 = all train."""
+    use_masks: bool = True
+    """Read the user's masks/ (0 = ignore)."""
+    use_depth: bool = True
+    """Read the depth prior in depth/."""
+    max_image_pixels: int = MAX_IMAGE_PIXELS
+    """Pictures with more pixels are left out unread."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing."""
+        if not 1 <= self.downscale < float("inf"):
+            raise UserError(f"downscale {self.downscale}: must be 1 (full size) or more")
+        if self.holdout < 0 or self.holdout == 1:
+            raise UserError(f"holdout {self.holdout}: must be 0 (all photos train) or at least 2")
+
+
+def load_scene(
+    root: Path, config: DataConfig | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> Scene:
+    """Read a COLMAP scene: cameras, points, split, photos (decoded once, kept as 8 bits), masks, depth.
+
+    Args:
+        root: Folder with `images/` and `sparse/0/` (or `sparse/`, `dense/sparse/`), optionally a `*.tsv`
+            split, `masks/`, `depth/` and `truth/`.
+        config: Size, split and limits; the defaults where None.
+        progress: Called with (photos read, photos in all) as photos are decoded.
+
+    Returns:
+        The scene in its aligned frame (+z up, median depth 1).
+
+    Raises:
+        UserError: There is no model, point, readable photo or photo to train on, or a file has the wrong
+            shape.
+    """
+    root, config = Path(root), config or DataConfig()
+    model = read_model(root)
+    splits = assign_splits([image.name for image in model.images], root, config.holdout)
+    alignment = align_world(
+        [_unit_camera(image) for image in model.images],
+        model.points,
+        [image.median_depth for image in model.images if image.median_depth is not None],
+    )
+    chosen = [image for image in model.images if image.name in splits]
+    views, broken = _load_views(chosen, splits, alignment, model.images_dir, root, config, progress)
+    _report_broken(broken, views, model.images_dir)
+    return Scene(
+        root=root,
+        views=tuple(views),
+        points=alignment.apply_points(model.points).to(torch.float32),
+        point_colors=model.point_colors,
+        alignment=alignment,
+    )
+
+
+def _unit_camera(image: ColmapImage) -> Camera:
+    """The photo's pose; alignment looks at nothing else."""
+    return Camera(viewmat=image.viewmat, K=torch.eye(3, dtype=torch.float64), width=1, height=1)
+
+
+def _load_views(
+    chosen: Sequence[ColmapImage],
+    splits: dict[str, Split],
+    alignment: Alignment,
+    images_dir: Path,
+    root: Path,
+    config: DataConfig,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[list[View], list[tuple[str, str]]]:
+    """Views in the order of their names, and (name, reason) of the photos that cannot be read."""
+    views: list[View] = []
+    broken: list[tuple[str, str]] = []
+
+    def load(image: ColmapImage) -> View | str:
+        try:
+            return _load_view(image, splits[image.name], alignment, images_dir, root, config)
+        except UnreadableImageError as error:
+            return str(error)
+
+    pool = ThreadPoolExecutor(DECODERS)
+    try:
+        for count, (image, view) in enumerate(zip(chosen, pool.map(load, chosen), strict=True), start=1):
+            if isinstance(view, str):
+                broken.append((image.name, view))
+            else:
+                views.append(view)
+            if progress is not None:
+                progress(count, len(chosen))
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return views, broken
+
+
+def _load_view(
+    image: ColmapImage, split: Split, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
+) -> View:
+    if image.camera.is_spherical():
+        raise UserError(f"{image.name}: spherical cameras ({image.camera.model_name}) are not supported")
+    grid = PixelGrid.from_colmap(image.camera, config.downscale)
+    camera = alignment.apply_camera(Camera(image.viewmat, grid.K, grid.width, grid.height))
+    files = PhotoFiles(root, images_dir, image.name, grid, config.max_image_pixels)
+    pictures = files.load(use_mask=config.use_masks, use_depth=config.use_depth)
+    return View(
+        name=image.name,
+        camera=replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float()),
+        split=split,
+        read_photo=pictures.read_photo,
+        read_mask=pictures.read_mask,
+        read_disparity=pictures.read_disparity,
+        read_clean=files.read_clean,
+        read_truth_mask=files.read_truth_mask,
+    )
+
+
+def _report_broken(broken: Sequence[tuple[str, str]], views: Sequence[View], images_dir: Path) -> None:
+    """Name the photos left out; stop where no photo is left to train."""
+    described = describe_names([f"{name} ({reason})" for name, reason in broken])
+    if not any(view.split == "train" for view in views):
+        raise UserError(f"{images_dir}: no photo to train can be read: {described}")
+    if broken:
+        warnings.warn(
+            f"{len(broken)} photos in {images_dir} cannot be read and are left out: {described}",
+            WildGSWarning,
+            stacklevel=3,
+        )
