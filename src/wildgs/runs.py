@@ -94,7 +94,7 @@ def start_training(
     write_config(folder / CONFIG_FILE, config)
     torch.manual_seed(config.train.seed)
     method = create_method(config.method, config.model, scene.points, scene.point_colors)
-    return Trainer(method.to(device or default_device()), scene.train_views, config.train)
+    return Trainer(method.to(device or default_device()), scene, config.train)
 
 
 def resume_training(folder: Path, scene: Scene, device: torch.device | None = None) -> Trainer:
@@ -108,7 +108,7 @@ def resume_training(folder: Path, scene: Scene, device: torch.device | None = No
     if checkpoint is None:
         raise UserError(f"{folder} has no checkpoint to resume from; leave --resume out")
     method = restore_method(config.method, config.model, checkpoint.method)
-    trainer = Trainer(method.to(device or default_device()), scene.train_views, config.train)
+    trainer = Trainer(method.to(device or default_device()), scene, config.train)
     trainer.restore(checkpoint.state)
     return trainer
 

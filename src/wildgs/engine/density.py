@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from wildgs.engine.optimizers import edit_rows, reset_moments
@@ -148,12 +148,3 @@ class DensityControl:
         ceiling = torch.tensor(self.config.reset_opacity).logit()
         gaussians.rows["opacity_logits"].clamp_(max=float(ceiling))
         reset_moments(optimizer, gaussians, "opacity_logits")
-
-
-def scene_extent(centres: Float[Tensor, "V 3"]) -> float:
-    """3DGS's spatial scale: 1.1 times the largest distance of a camera from the cameras' mean.
-
-    One camera alone has no such distance; then 1 (the aligned frame's unit is the median depth).
-    """
-    distance = (centres - centres.mean(dim=0)).norm(dim=-1).max()
-    return float(distance) * 1.1 if len(centres) > 1 and distance > 1e-6 else 1.0

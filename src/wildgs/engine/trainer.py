@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from wildgs.data import View
-from wildgs.engine.density import DensityConfig, DensityControl, DensityReport, scene_extent
+from wildgs.data import Scene, View, scene_extent
+from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig
@@ -72,32 +72,32 @@ Observer = Callable[[StepReport], None]
 
 
 class Trainer:
-    """Trains a method on views."""
+    """Trains a method on a scene's training photos."""
 
-    def __init__(self, method: Method, views: Sequence[View], config: TrainConfig) -> None:
+    def __init__(self, method: Method, scene: Scene, config: TrainConfig) -> None:
         """Args:
         method: Trained in place, on the device on which its parameters are.
-        views: The training photos.
+        scene: The photos; nothing of it under `truth/` is read.
         config: How.
 
         Raises:
             UserError: There is no photo to train on.
         """
-        if not views:
-            raise UserError("no photo to train on: the split leaves none with a camera")
+        self.views = scene.train_views
+        if not self.views:
+            raise UserError(f"{scene.root}: no photo to train on; the split leaves none that has a camera")
         self.method = method
-        self.views = list(views)
         self.config = config
         self.device = method.gaussians.means.device
         self.step = 0
         self.seconds = 0.0
         self.schedule = Schedule(config.schedule, config.steps)
         self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
-        extent = scene_extent(torch.stack([view.camera.position for view in views]))
+        extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent)
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.sampler = ViewSampler(len(views), self.generator)
+        self.sampler = ViewSampler(len(self.views), self.generator)
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step."""
