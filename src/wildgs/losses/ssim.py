@@ -50,7 +50,7 @@ class _CpuSSIM(torch.autograd.Function):
         row_sums = torch.empty(height, dtype=x.dtype)
         c1, c2 = taps.dtype.type(C1), taps.dtype.type(C2)
         pictures = _matrix(x), _matrix(y)
-        ssim_forward(*pictures, taps, c1, c2, channels, *derivatives.numpy(), row_sums.numpy())
+        ssim_forward(*pictures, taps, c1, c2, channels, derivatives.numpy(), row_sums.numpy())
         ctx.save_for_backward(x, y, derivatives)
         return (row_sums.sum(dtype=torch.float64) / x.numel()).to(x.dtype)
 
@@ -61,7 +61,7 @@ class _CpuSSIM(torch.autograd.Function):
         scale = taps.dtype.type(grads[0].item() / x.numel())
         grad_x, grad_y = torch.empty_like(x), torch.empty_like(y)
         pictures, grads_out = (_matrix(x), _matrix(y)), (_matrix(grad_x), _matrix(grad_y))
-        ssim_backward(*pictures, taps, scale, x.shape[2], *derivatives.numpy(), *grads_out)
+        ssim_backward(*pictures, taps, scale, x.shape[2], derivatives.numpy(), *grads_out)
         return grad_x, grad_y
 
 
