@@ -18,6 +18,12 @@ from wildgs.geometry.camera import Camera
 INLIER_SHARE = 0.9
 """Share of the points, nearest first, from which the principal directions are taken."""
 
+LEVEL_TOLERANCE = 0.02
+"""Sine of the roll with which people hold a camera level; rolls beyond it count less and less."""
+
+PRIOR_WEIGHT = 0.01
+"""Weight of the mean up vector against the horizontal axes (whose mean square cosine is up to 1/2)."""
+
 
 def align_world(
     cameras: Sequence[Camera],
@@ -37,13 +43,31 @@ def align_world(
     """
     points = points.to(torch.float64)
     positions = torch.stack([camera.position.to(torch.float64) for camera in cameras])
-    up = _robust_mean(torch.stack([camera.up.to(torch.float64) for camera in cameras]))
+    up = _estimate_up(torch.stack([camera.viewmat[:3, :3].to(torch.float64) for camera in cameras]))
     centre = points.median(dim=0).values
     rotation = _ground_axes(up, points - centre, positions - centre)
     # The median of each coordinate depends on the axes, so it is taken once more along the final ones.
     centre = (points @ rotation.T).median(dim=0).values
     scale = _unit_depth_scale(points, positions, view_depths)
     return Alignment(rotation=rotation, translation=-scale * centre, scale=scale)
+
+
+def _estimate_up(rotations: Float[Tensor, "V 3 3"], iterations: int = 20) -> Float[Tensor, "3"]:
+    """The direction away from the ground, from the cameras' axes.
+
+    The mean of the pictures' up vectors leans as far as the photographers tilt their cameras (all of them
+    upwards, under a tower). Their horizontal axes do not lean, so the direction most at right angles to those,
+    by least absolute cosines, corrects the mean; where all photos face one way, it stays.
+    """
+    right = rotations[:, 0]
+    prior = _robust_mean(-rotations[:, 1])
+    up = prior
+    for _ in range(iterations):
+        weights = 1.0 / ((right @ up).abs() + LEVEL_TOLERANCE)
+        spread = right.T @ (right * (weights / weights.sum())[:, None])
+        up = torch.linalg.solve(spread + PRIOR_WEIGHT * torch.eye(3).to(right), prior)
+        up = up / up.norm()
+    return up
 
 
 def _robust_mean(directions: Float[Tensor, "V 3"], iterations: int = 50) -> Float[Tensor, "3"]:
