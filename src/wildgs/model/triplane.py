@@ -53,7 +53,7 @@ def robust_box(points: Float[Tensor, "P 3"], quantile: float, ratio: float) -> B
     low = ordered[round(quantile * last)]
     high = ordered[round((1 - quantile) * last)]
     middle = ordered[last // 2]
-    reach = (high - low).max().clamp_min(1e-6)
+    reach = (high - low).max().clamp_min(0.01)
     low = torch.minimum(middle + ratio * (low - middle), middle - 0.01 * reach)
     high = torch.maximum(middle + ratio * (high - middle), middle + 0.01 * reach)
     return Box(low, high)

@@ -1,0 +1,112 @@
+"""2D Parsing: shapes, pretrained weights from a folder, and a function that does not drift."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from transformers import ResNetConfig, ResNetModel
+
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.model.encoder import FEATURE_WIDTHS, FrozenBatchNorm, load_encoder
+from wildgs.model.parsing import Parsing, ParsingConfig
+
+
+@pytest.fixture(scope="module")
+def parsing() -> Parsing:
+    torch.manual_seed(0)
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
+    parsing.calibrate([torch.rand(40, 60, 3) for _ in range(4)])
+    return parsing
+
+
+def save_resnet(folder: Path, widths: list[int]) -> ResNetModel:
+    config = ResNetConfig(
+        embedding_size=64, hidden_sizes=widths, depths=[2] * len(widths), layer_type="basic"
+    )
+    model = ResNetModel(config)
+    model.save_pretrained(folder)
+    return model
+
+
+@pytest.mark.parametrize("size", [(48, 64), (100, 37), (7, 300), (1, 1)])
+def test_mask_has_the_photos_size_and_starts_static(parsing: Parsing, size: tuple[int, int]) -> None:
+    visibility, embedding = parsing(torch.rand(*size, 3))
+    assert visibility.shape == size
+    assert embedding.shape == (16,)
+    assert (visibility > 0.5).all()
+    assert (visibility < 1).all()
+
+
+def test_same_photo_gives_the_same_in_training_and_evaluation(parsing: Parsing) -> None:
+    photo = torch.rand(48, 64, 3)
+    trained = parsing.train()(photo)
+    parsing(torch.rand(48, 64, 3))
+    evaluated = parsing.eval()(photo)
+    torch.testing.assert_close(trained, evaluated)
+
+
+def test_brightness_reaches_the_global_embedding(parsing: Parsing) -> None:
+    """What group or instance normalisation would remove."""
+    photo = torch.rand(48, 64, 3)
+    difference = (parsing(photo)[1] - parsing(photo * 0.3)[1]).norm()
+    assert difference > 1e-3
+
+
+def test_mask_and_embedding_train_the_encoder(parsing: Parsing) -> None:
+    torch.nn.init.normal_(parsing.mask_head.weight, std=0.1)
+    for output in (0, 1):
+        parsing.zero_grad()
+        parsing(torch.rand(48, 64, 3))[output].sum().backward()
+        gradient = next(parsing.encoder.embedder.parameters()).grad
+        assert gradient is not None
+        assert gradient.abs().sum() > 0
+
+
+def test_calibration_normalises_a_fresh_encoder() -> None:
+    encoder = load_encoder(None)
+    images = torch.rand(4, 3, 64, 64) * 0.1
+    encoder.calibrate(images)
+    features = encoder(images)
+    assert [f.shape[1] for f in features] == list(FEATURE_WIDTHS)
+    assert 0.1 < float(features[-1].detach().std()) < 10
+
+
+def test_pretrained_weights_come_from_a_folder(tmp_path: Path) -> None:
+    saved = save_resnet(tmp_path, [64, 128, 256, 512])
+    for norm in saved.modules():
+        if isinstance(norm, torch.nn.BatchNorm2d):
+            norm.running_mean.uniform_(-1, 1)  # pyright: ignore[reportOptionalMemberAccess]
+    saved.save_pretrained(tmp_path)
+    encoder = load_encoder(str(tmp_path))
+    assert encoder.pretrained
+    image = torch.rand(1, 3, 64, 64)
+    normalised = (image - encoder.mean) / encoder.std
+    expected = saved.eval()(normalised).last_hidden_state
+    torch.testing.assert_close(encoder.train()(image)[-1], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_pretrained_statistics_are_not_recalibrated(tmp_path: Path) -> None:
+    save_resnet(tmp_path, [64, 128, 256, 512])
+    encoder = load_encoder(str(tmp_path))
+    norm = next(m for m in encoder.modules() if isinstance(m, FrozenBatchNorm))
+    before = norm.running_mean.clone()
+    encoder.calibrate(torch.rand(2, 3, 32, 32))
+    assert torch.equal(norm.running_mean, before)
+
+
+def test_missing_weights_are_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.warns(WildGSWarning, match="learnt from scratch") as caught:
+        encoder = load_encoder("nobody/no-such-network")
+    assert len(caught) == 1
+    assert not encoder.pretrained
+
+
+def test_folder_with_another_network_is_a_users_mistake(tmp_path: Path) -> None:
+    save_resnet(tmp_path, [8, 16])
+    with pytest.raises(UserError, match="another network"):
+        load_encoder(str(tmp_path))
+    with pytest.raises(UserError, match="does not hold a ResNet-18"):
+        load_encoder(str(tmp_path.parent))
