@@ -7,16 +7,21 @@ a cell follows axis a and the row follows axis b; the third axis is the one alon
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from wildgs.model.sampling_kernels import sample_backward, sample_forward
+from wildgs.rasterize.cpu.threads import launch
+
 PLANE_AXES = ((0, 1), (1, 2), (2, 0))
 VIEW_AXIS = (2, 0, 1)
 PICTURE_CHANNELS = 4
 """Red, green, blue, validity."""
+POINTS_PER_ITEM = 1024
 
 
 @dataclass(frozen=True)
@@ -109,12 +114,36 @@ def sample_planes(
 ) -> Float[Tensor, "N C"]:
     """f_xy + f_yz + f_zx: bilinear samples of the three planes at points, summed.
 
+    Differentiable in the planes; the points take no gradient on the CPU.
+
     Args:
         planes: Feature maps of XY, YZ and ZX.
-        points: Normalised positions in [-1, 1]; cell centres lie at (2 i + 1) / R - 1.
+        points: Normalised positions in [-1, 1]; cell centres lie at (2 i + 1) / R - 1, and beyond the outermost
+            centres the border is repeated.
     """
-    grid = torch.stack([points[:, axes] for axes in (list(pair) for pair in PLANE_AXES)])
+    if planes.device.type == "cpu" and planes.dtype == torch.float32:
+        return _SampleOnCPU.apply(planes, points)
+    grid = torch.stack([points[:, list(axes)] for axes in PLANE_AXES])
     sampled = functional.grid_sample(
         planes, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False
     )
     return sampled.sum(dim=0)[:, 0].T
+
+
+class _SampleOnCPU(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor, points: Tensor) -> Tensor:
+        cells = planes.detach().permute(0, 2, 3, 1).contiguous()
+        points = points.detach().contiguous()
+        out = torch.empty(len(points), planes.shape[1])
+        launch(sample_forward, cells.numpy(), points.numpy(), POINTS_PER_ITEM, out.numpy())
+        ctx.save_for_backward(points)
+        ctx.shape = cells.shape
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (points,) = ctx.saved_tensors
+        out = torch.zeros(ctx.shape)
+        launch(sample_backward, gradients[0].contiguous().numpy(), points.numpy(), out.numpy())
+        return out.permute(0, 3, 1, 2), None
