@@ -70,7 +70,16 @@ def _matrix(picture: Tensor) -> Any:
 
 
 def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
-    """The same by two separable convolutions; used on accelerators."""
+    return ssim_map(x, y).mean()
+
+
+def ssim_map(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
+    """Structural similarity of every pixel, same conventions as `ssim`, by two separable convolutions.
+
+    Args:
+        x: A picture with data range 1.
+        y: The other picture.
+    """
     x, y = x.permute(2, 0, 1), y.permute(2, 0, 1)
     taps = gaussian_taps(x.dtype, x.device)
     moments = torch.stack([x, y, x * x, y * y, x * y]).flatten(0, 1)[:, None]
@@ -79,4 +88,5 @@ def _ssim_by_convolution(x: Tensor, y: Tensor) -> Tensor:
     mean_x, mean_y, square_x, square_y, cross = moments.view(5, *x.shape)
     product, squares = mean_x * mean_y, mean_x**2 + mean_y**2
     covariance, variances = cross - product, square_x + square_y - squares
-    return ((2 * product + C1) * (2 * covariance + C2) / ((squares + C1) * (variances + C2))).mean()
+    similarity = (2 * product + C1) * (2 * covariance + C2) / ((squares + C1) * (variances + C2))
+    return similarity.permute(1, 2, 0)

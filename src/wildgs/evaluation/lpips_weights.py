@@ -1,0 +1,172 @@
+"""Where LPIPS's weights are: a folder, torch's hub cache, an installed package, the official download."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from wildgs.evaluation.lpips import LPIPS, Network
+
+ENVIRONMENT = "WILDGS_LPIPS"
+"""A folder with a backbone and its linear layers, or ``off`` for no LPIPS at all."""
+
+OFFICIAL = {"alex": "alexnet-owt-7be5be79.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
+_BACKBONE_URL = "https://download.pytorch.org/models/"
+_LINEAR_URL = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/"
+_BACKBONE_NAMES = {"alex": "alexnet*.pth", "squeeze": "squeezenet1_1*.pth"}
+_TIMEOUT_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class LpipsFiles:
+    """Weights at hand.
+
+    Attributes:
+        network: Which backbone.
+        backbone: Its file, torchvision's layout.
+        linear: LPIPS's linear layers.
+    """
+
+    network: Network
+    backbone: Path
+    linear: Path
+
+
+def find_lpips(folder: Path | None = None) -> LpipsFiles | None:
+    """Weights on this machine, AlexNet's before SqueezeNet's; downloads nothing.
+
+    Args:
+        folder: Looked at alone where given; else the folder that `WILDGS_LPIPS` names; else torch's hub
+            cache, with linear layers beside the backbone or in an installed `lpips` or `torchmetrics`.
+    """
+    chosen = folder or _folder_from_environment()
+    if chosen is not None:
+        return _find_in([chosen], [chosen])
+    checkpoints = _hub_folder()
+    return _find_in([checkpoints], [checkpoints, *_package_folders()])
+
+
+def load_lpips(folder: Path | None = None, download: bool = True) -> tuple[LPIPS | None, str]:
+    """The network, and a line for the notes that says which one it is, or why there is none.
+
+    Args:
+        folder: As for `find_lpips`.
+        download: Whether to try the official AlexNet weights (240 MB, tried once) where none are at hand.
+    """
+    setting = os.environ.get(ENVIRONMENT, "").strip()
+    if folder is None and setting.lower() == "off":
+        return None, f"LPIPS is null: {ENVIRONMENT} is off"
+    explicit = folder or _folder_from_environment()
+    files = find_lpips(folder)
+    if files is None and explicit is not None:
+        return None, (
+            f"LPIPS is null: {explicit} holds no backbone (alexnet*.pth or squeezenet1_1*.pth) "
+            "with linear layers (linear.pth, alex.pth or squeeze.pth)"
+        )
+    if files is None and download:
+        files = _download()
+    if files is None:
+        return None, f"LPIPS is null: its weights are not at hand; {how_to_get_lpips()}"
+    try:
+        model = LPIPS(files.network)
+        model.load(_read(files.backbone), _read(files.linear))
+    except (
+        Exception
+    ) as error:  # unpickling raises errors of many kinds; scores without LPIPS beat none at all
+        return (
+            None,
+            f"LPIPS is null: {files.backbone} or {files.linear} cannot be used ({_first_line(error)})",
+        )
+    return model, f"LPIPS v0.1 with {'AlexNet' if files.network == 'alex' else 'SqueezeNet 1.1'}"
+
+
+def how_to_get_lpips() -> str:
+    """What to type so that LPIPS is there next time."""
+    checkpoints = _hub_folder()
+    name = OFFICIAL["alex"]
+    return (
+        f"mkdir -p {checkpoints} && curl -L {_BACKBONE_URL}{name} -o {checkpoints / name} "
+        f"&& curl -L {_LINEAR_URL}alex.pth -o {checkpoints / 'lpips_alex.pth'}"
+    )
+
+
+def _folder_from_environment() -> Path | None:
+    setting = os.environ.get(ENVIRONMENT, "").strip()
+    return Path(setting).expanduser() if setting and setting.lower() != "off" else None
+
+
+def _hub_folder() -> Path:
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def _find_in(backbones: list[Path], linears: list[Path]) -> LpipsFiles | None:
+    networks: tuple[Network, Network] = ("alex", "squeeze")
+    for network in networks:
+        for folder in backbones:
+            backbone = next(iter(sorted(folder.glob(_BACKBONE_NAMES[network]))), None)
+            names = (f"lpips_{network}.pth", f"{network}.pth", "linear.pth")
+            linear = next((f / n for f in linears for n in names if (f / n).is_file()), None)
+            if backbone is not None and linear is not None:
+                return LpipsFiles(network, backbone, linear)
+    return None
+
+
+def _package_folders() -> list[Path]:
+    """Folders of installed packages that ship LPIPS's linear layers; the packages are not imported."""
+    places = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
+    folders = []
+    for package, place in places.items():
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.submodule_search_locations:
+            folders.append(Path(next(iter(spec.submodule_search_locations))) / place)
+    return folders
+
+
+@cache
+def _download() -> LpipsFiles | None:
+    """The official AlexNet weights into torch's hub cache; None where they cannot be reached. Tried once."""
+    try:
+        with _socket_timeout(_TIMEOUT_SECONDS):
+            # The small file first: without a network nothing waits for the large one.
+            for url, name in (
+                (_LINEAR_URL + "alex.pth", "lpips_alex.pth"),
+                (_BACKBONE_URL + OFFICIAL["alex"], None),
+            ):
+                torch.hub.load_state_dict_from_url(
+                    url,
+                    map_location="cpu",
+                    progress=False,
+                    check_hash=name is None,
+                    file_name=name,
+                    weights_only=True,
+                )
+    except Exception:  # urllib, ssl, socket, unpickling and hash errors alike mean that there are no weights
+        return None
+    return find_lpips()
+
+
+@contextmanager
+def _socket_timeout(seconds: float) -> Iterator[None]:
+    previous = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(seconds)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(previous)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,59 @@
+"""Files of an evaluation: pictures by view, each written aside and renamed."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from jaxtyping import UInt8
+from PIL import Image
+from torch import Tensor
+
+
+def picture_paths(names: Iterable[str]) -> dict[str, PurePosixPath]:
+    """Where each view's picture goes, relative to the evaluation's folder.
+
+    Folders in a name are kept. A part that would leave the folder (``..``, a root, a drive) is replaced, and
+    views that differ by their suffix alone keep it, so that no two views share a file.
+
+    Args:
+        names: Unique view names.
+    """
+    safe = {name: _inside(name) for name in names}
+    stems = Counter(str(path.with_suffix(".png")).lower() for path in safe.values())
+    paths: dict[str, PurePosixPath] = {}
+    taken: set[str] = set()
+    for name, path in safe.items():
+        target = path.with_suffix(".png")
+        if stems[str(target).lower()] > 1:
+            target = path.with_name(path.name + ".png")
+        while str(target).lower() in taken:
+            target = target.with_name("_" + target.name)
+        taken.add(str(target).lower())
+        paths[name] = target
+    return paths
+
+
+def _inside(name: str) -> PurePosixPath:
+    parts = [part.replace(":", "_") for part in name.replace("\\", "/").split("/")]
+    parts = ["_" if part == ".." else part for part in parts if part not in ("", ".")]
+    return PurePosixPath(*parts) if parts else PurePosixPath("_")
+
+
+def write_picture(file: Path, picture: UInt8[Tensor, "H W 3"]) -> None:
+    """Write a PNG; a run cut short leaves no half picture under its name."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    aside = file.with_name(file.name + ".part")
+    Image.fromarray(picture.cpu().numpy()).save(aside, format="PNG")
+    aside.replace(file)
+
+
+def write_json(file: Path, content: dict[str, Any]) -> None:
+    """Write strict JSON (no NaN), aside first and renamed."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    aside = file.with_name(file.name + ".part")
+    aside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    aside.replace(file)

@@ -1,0 +1,254 @@
+"""The two protocols of evaluation, never mixed: appearance from the whole photo, or from its left half."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from wildgs.data.scene import Scene, View
+from wildgs.errors import UserError
+from wildgs.evaluation.lpips import LPIPS, MIN_SIDE
+from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.masks import MaskScore
+from wildgs.evaluation.metrics import psnr, structural_similarity, to_8bit
+from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
+from wildgs.model.method import Method
+
+Protocol = Literal["full", "half"]
+METRICS = ("psnr", "ssim", "lpips")
+_TIMED_FRAMES = 15
+
+
+@dataclass(frozen=True)
+class ImageScore:
+    """One view's scores; None where a metric could not be computed."""
+
+    name: str
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+
+
+@dataclass
+class _Notes:
+    """Lines for the reader of `metrics.json`, each once."""
+
+    lines: list[str] = field(default_factory=list)
+
+    def add(self, line: str) -> None:
+        if line not in self.lines:
+            self.lines.append(line)
+
+
+def evaluate(
+    method: Method,
+    scene: Scene,
+    protocol: Protocol,
+    run: Path,
+    *,
+    step: int,
+    train_seconds: float | None = None,
+    lpips_folder: Path | None = None,
+    mask_threshold: float = 0.5,
+    on_view: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Render and score the held-out views; write ``eval/<protocol>/<stem>.png`` and ``metrics.json``.
+
+    `full` reads a view's appearance from the whole test photo and scores the whole frame. `half` reads it
+    from the left half alone (columns below ``W // 2``, with the camera cropped to them: mask, embedding and
+    lifting see nothing else) and scores the other columns as a picture of their own; the file holds the whole
+    frame.
+
+    A view is scored against its clean truth where there is one, else against the photo. In the latter case
+    pixels that the view's mask ignores count neither in PSNR nor in SSIM, and are made equal to the photo's
+    before LPIPS. Renders are rounded to 8 bits first.
+
+    In `full`, predicted masks of training photos are scored too, where the scene holds true masks.
+
+    Args:
+        method: A trained method.
+        scene: With at least one test view.
+        protocol: Which of the two.
+        run: The run folder.
+        step: Training steps that `method` has seen, for the record.
+        train_seconds: How long they took, for the record.
+        lpips_folder: LPIPS's weights; None looks where `find_lpips` says.
+        mask_threshold: Th, for the intersection over union of masks.
+        on_view: Told each view's name when it is done.
+
+    Returns:
+        What `metrics.json` holds.
+
+    Raises:
+        UserError: The scene holds out no photo.
+    """
+    if not scene.test_views:
+        raise UserError(f"{scene.root} holds out no photo to score: mark some as 'test' in its split .tsv")
+    folder = run / "eval" / protocol
+    lpips, line = load_lpips(lpips_folder)
+    notes = _Notes([line])
+    device = method.gaussians.means.device
+    lpips = lpips.to(device) if lpips is not None else None
+    paths = picture_paths(view.name for view in scene.test_views)
+    with _inference(method):
+        scores = []
+        for view in scene.test_views:
+            render = _render_view(method, view, protocol, device, notes)
+            write_picture(folder / paths[view.name], render)
+            scores.append(_score_view(view, render, protocol, lpips, notes))
+            if on_view is not None:
+                on_view(view.name)
+        fps = _measure_fps(method, scene.test_views, device)
+        masks = _score_masks(method, scene, device, mask_threshold) if protocol == "full" else None
+    content: dict[str, Any] = {
+        "protocol": protocol,
+        "step": step,
+        "num_gaussians": method.num_gaussians,
+        "train_seconds": train_seconds,
+        "render_fps": fps,
+        "device": _describe(device),
+        "mean": {metric: _mean(scores, metric) for metric in METRICS},
+        "images": [asdict(score) for score in scores],
+        "notes": notes.lines,
+    }
+    if masks is not None:
+        content["masks"] = masks.as_dict()
+    write_json(folder / "metrics.json", content)
+    return content
+
+
+@contextmanager
+def _inference(method: Method) -> Iterator[None]:
+    # Not inference_mode: what a method caches meanwhile must stay usable for training.
+    training = method.training
+    method.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        method.train(training)
+
+
+def _render_view(
+    method: Method, view: View, protocol: Protocol, device: torch.device, notes: _Notes
+) -> UInt8[Tensor, "H W 3"]:
+    photo, camera = _read_photo(view, device), view.camera.to(device)
+    if protocol == "half":
+        half = photo.shape[1] // 2
+        appearance = method.encode(photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height))
+    else:
+        appearance = method.encode(photo, camera)
+    colors = method.render(camera, method.shade(appearance)).colors
+    if not colors.isfinite().all():
+        notes.add(f"{view.name}: the render holds values that are no numbers, scored as black")
+    return to_8bit(colors)
+
+
+def _read_photo(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
+    return view.read_photo().to(device).float() / 255
+
+
+def _score_view(
+    view: View, render: UInt8[Tensor, "H W 3"], protocol: Protocol, lpips: LPIPS | None, notes: _Notes
+) -> ImageScore:
+    clean = view.read_clean()
+    truth = (view.read_photo() if clean is None else clean).to(render.device)
+    keep = _read_keep(view, render.device) if clean is None else None
+    if clean is not None:
+        notes.add("views with a clean truth are scored against it, not against the photo")
+    if protocol == "half":
+        half = render.shape[1] // 2
+        render, truth = render[:, half:], truth[:, half:]
+        keep = None if keep is None else keep[:, half:]
+    if keep is not None:
+        notes.add(
+            "pixels that a photo's mask ignores are left out of PSNR and SSIM, and equal the photo's in LPIPS"
+        )
+        if not keep.any():
+            notes.add(f"{view.name}: its mask ignores all that would be scored")
+            return ImageScore(view.name, None, None, None)
+    return ImageScore(
+        name=view.name,
+        psnr=psnr(render, truth, keep),
+        ssim=structural_similarity(render, truth, keep),
+        lpips=_perceptual(view, render, truth, keep, lpips, notes),
+    )
+
+
+def _read_keep(view: View, device: torch.device) -> Bool[Tensor, "H W"] | None:
+    mask = view.read_mask()
+    return None if mask is None else (mask > 0).to(device)
+
+
+def _perceptual(
+    view: View,
+    render: UInt8[Tensor, "H W 3"],
+    truth: UInt8[Tensor, "H W 3"],
+    keep: Bool[Tensor, "H W"] | None,
+    lpips: LPIPS | None,
+    notes: _Notes,
+) -> float | None:
+    if lpips is None:
+        return None
+    if min(render.shape[:2]) < MIN_SIDE:
+        notes.add(f"{view.name}: LPIPS is null, the scored part has less than {MIN_SIDE} pixels a side")
+        return None
+    if keep is not None:
+        render = torch.where(keep[..., None], render, truth)
+    return float(lpips(render, truth))
+
+
+def _measure_fps(method: Method, views: tuple[View, ...], device: torch.device) -> float:
+    """Frames per second of plain rendering: harmonics shaded once, views at their sizes, the median frame."""
+    first = views[0]
+    sh = method.shade(method.encode(_read_photo(first, device), first.camera.to(device)))
+    cameras = [view.camera.to(device) for view in views[:_TIMED_FRAMES]]
+    method.render(cameras[0], sh)
+    seconds = []
+    for i in range(_TIMED_FRAMES):
+        _synchronize(device)
+        start = time.perf_counter()
+        method.render(cameras[i % len(cameras)], sh)
+        _synchronize(device)
+        seconds.append(time.perf_counter() - start)
+    return 1 / statistics.median(seconds)
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _score_masks(method: Method, scene: Scene, device: torch.device, threshold: float) -> MaskScore | None:
+    """Scores of training photos' masks; None where there is no truth or the method predicts no mask."""
+    score = MaskScore(threshold)
+    for view in scene.train_views:
+        truth = view.read_truth_mask()
+        if truth is None:
+            continue
+        visibility = method.encode(_read_photo(view, device), view.camera.to(device)).visibility
+        if visibility is None:
+            return None
+        score.add(visibility, truth > 127)
+    return score if score.images else None
+
+
+def _mean(scores: list[ImageScore], metric: str) -> float | None:
+    values = [value for value in (getattr(score, metric) for score in scores) if value is not None]
+    return math.fsum(values) / len(values) if values else None
+
+
+def _describe(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{device.type}, {torch.get_num_threads()} threads"

@@ -1,0 +1,66 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from wildgs.evaluation.metrics import MAX_PSNR, psnr, structural_similarity, to_8bit
+
+
+def separable_ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """SSIM of one channel by numpy alone: rows and columns convolved, zeros outside."""
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    taps /= taps.sum()
+
+    def blur(z: np.ndarray) -> np.ndarray:
+        for axis in (0, 1):
+            z = np.apply_along_axis(lambda line: np.convolve(np.pad(line, 5), taps, mode="valid"), axis, z)
+        return z
+
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    return (2 * mx * my + 0.01**2) * (2 * cov + 0.03**2) / ((mx**2 + my**2 + 0.01**2) * (vx + vy + 0.03**2))
+
+
+@pytest.fixture
+def pair() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.randint(0, 256, (33, 47, 3), dtype=torch.uint8, generator=generator)
+    noise = torch.randint(-30, 31, truth.shape, generator=generator)
+    return (truth + noise).clamp(0, 255).to(torch.uint8), truth
+
+
+def test_rounding_is_to_the_nearest_and_clamped():
+    values = torch.tensor([-0.2, 0.0, 0.4999 / 255, 0.5001 / 255, 1.0, 1.7, math.nan, math.inf, -math.inf])
+    picture = values[:, None, None].expand(-1, 1, 3)
+    assert to_8bit(picture)[:, 0, 0].tolist() == [0, 0, 0, 1, 255, 255, 0, 255, 0]
+
+
+def test_psnr_of_a_known_error():
+    truth = torch.full((4, 5, 3), 100, dtype=torch.uint8)
+    assert psnr(truth + 10, truth) == pytest.approx(20 * math.log10(255 / 10))
+    assert psnr(truth, truth) == MAX_PSNR
+
+
+def test_psnr_counts_kept_pixels_only():
+    truth = torch.full((4, 6, 3), 100, dtype=torch.uint8)
+    render = truth + 10
+    render[:, 3:] = 255
+    keep = torch.zeros(4, 6, dtype=torch.bool)
+    keep[:, :3] = True
+    assert psnr(render, truth, keep) == pytest.approx(20 * math.log10(255 / 10))
+
+
+def test_ssim_agrees_with_an_independent_implementation(pair):
+    render, truth = pair
+    maps = [separable_ssim_map(render[..., c].numpy() / 255, truth[..., c].numpy() / 255) for c in range(3)]
+    assert structural_similarity(render, truth) == pytest.approx(np.mean(maps), abs=1e-10)
+    keep = torch.rand(33, 47, generator=torch.Generator().manual_seed(1)) > 0.6
+    expected = np.mean([m[keep.numpy()] for m in maps])
+    assert structural_similarity(render, truth, keep) == pytest.approx(expected, abs=1e-10)
+
+
+def test_ssim_is_one_for_equal_pictures_and_falls_with_noise(pair):
+    render, truth = pair
+    assert structural_similarity(truth, truth) == pytest.approx(1)
+    assert structural_similarity(render, truth) < 0.999
