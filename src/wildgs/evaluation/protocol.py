@@ -100,15 +100,16 @@ def evaluate(
     device = method.gaussians.means.device
     lpips = lpips.to(device) if lpips is not None else None
     paths = picture_paths(view.name for view in scene.test_views)
+    scores: list[ImageScore] = []
     with _inference(method):
-        scores = []
         for view in scene.test_views:
-            render = _render_view(method, view, protocol, device, notes)
+            sh = _shade(method, view, protocol, device)
+            render = _render(method, view, sh, notes)
             write_picture(folder / paths[view.name], render)
             scores.append(_score_view(view, render, protocol, lpips, notes))
             if on_view is not None:
                 on_view(view.name)
-        fps = _measure_fps(method, scene.test_views, device)
+        fps = _measure_fps(method, sh, scene.test_views, device)
         masks = _score_masks(method, scene, device, mask_threshold) if protocol == "full" else None
     content: dict[str, Any] = {
         "protocol": protocol,
@@ -139,16 +140,17 @@ def _inference(method: Method) -> Iterator[None]:
         method.train(training)
 
 
-def _render_view(
-    method: Method, view: View, protocol: Protocol, device: torch.device, notes: _Notes
-) -> UInt8[Tensor, "H W 3"]:
+def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
+    """Harmonics under the view's own light, as far as the protocol shows it."""
     photo, camera = _read_photo(view, device), view.camera.to(device)
     if protocol == "half":
         half = photo.shape[1] // 2
-        appearance = method.encode(photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height))
-    else:
-        appearance = method.encode(photo, camera)
-    colors = method.render(camera, method.shade(appearance)).colors
+        photo, camera = photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height)
+    return method.shade(method.encode(photo, camera))
+
+
+def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Notes) -> UInt8[Tensor, "H W 3"]:
+    colors = method.render(view.camera.to(sh.device), sh).colors
     if not colors.isfinite().all():
         notes.add(f"{view.name}: the render holds values that are no numbers, scored as black")
     return to_8bit(colors)
@@ -208,10 +210,10 @@ def _perceptual(
     return float(lpips(render, truth))
 
 
-def _measure_fps(method: Method, views: tuple[View, ...], device: torch.device) -> float:
-    """Frames per second of plain rendering: harmonics shaded once, views at their sizes, the median frame."""
-    first = views[0]
-    sh = method.shade(method.encode(_read_photo(first, device), first.camera.to(device)))
+def _measure_fps(
+    method: Method, sh: Float[Tensor, "N K 3"], views: tuple[View, ...], device: torch.device
+) -> float:
+    """Frames per second of plain rendering under cached harmonics: the median frame of the views' cameras."""
     cameras = [view.camera.to(device) for view in views[:_TIMED_FRAMES]]
     method.render(cameras[0], sh)
     seconds = []
