@@ -56,7 +56,7 @@ def _estimate_up(rotations: Float[Tensor, "V 3 3"], iterations: int = 20) -> Flo
     """The direction away from the ground, from the cameras' axes.
 
     The mean of the pictures' up vectors leans as far as the photographers tilt their cameras (all of them
-    upwards, under a tower). Their horizontal axes do not lean, so the direction most at right angles to those,
+    upwards, under a tower). Their horizontal axes do not lean, so the direction most at right angles to them,
     by least absolute cosines, corrects the mean; where all photos face one way, it stays.
     """
     right = rotations[:, 0]

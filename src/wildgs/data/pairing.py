@@ -1,0 +1,183 @@
+"""Which photos to match with which: all with all for small sets, near neighbours for large ones.
+
+The cost of matching must not grow with the square of the number of photos. Neighbours come from the photos'
+GPS positions where enough of them carry one, else from retrieval by VLAD descriptors (Jegou et al.,
+"Aggregating local descriptors into a compact image representation", CVPR 2010) of the SIFT features that are
+there anyway, so that no vocabulary needs to be downloaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+PairingName = Literal["exhaustive", "gps", "retrieval"]
+
+EARTH_RADIUS = 6_371_000.0
+VLAD_WORDS = 64
+VLAD_FEATURES = 1000
+"""Descriptors per photo that retrieval looks at."""
+VLAD_TRAINING = 100_000
+"""Descriptors, over all photos, from which the words are learned."""
+
+
+@dataclass(frozen=True)
+class PairingConfig:
+    """When and how partners are chosen."""
+
+    exhaustive_limit: int = 200
+    """Sets of up to this many photos are matched all with all."""
+    neighbours: int = 40
+    """Partners per photo in larger sets."""
+    gps_share: float = 0.8
+    """Share of the photos that must carry a GPS position for neighbours to be chosen by it."""
+    gps_distance: float = 200.0
+    """Photos farther apart than this, in metres, are no neighbours by GPS."""
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Pairs of photos to match, as indices (low, high), sorted, without repetition."""
+
+    name: PairingName
+    pairs: tuple[tuple[int, int], ...]
+
+
+def exhaustive_pairs(count: int) -> Pairing:
+    """Every photo with every other."""
+    return Pairing("exhaustive", tuple(combinations(range(count), 2)))
+
+
+def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set[tuple[int, int]]:
+    """Photos with those that look most like them.
+
+    Args:
+        vlads: A unit vector for every photo.
+        partners: From the photos that look for partners to how many they look for.
+    """
+    pairs = set()
+    for photo, wanted in partners.items():
+        likeness = vlads @ vlads[photo]
+        likeness[photo] = -torch.inf
+        best = torch.topk(likeness, min(wanted, len(vlads) - 1)).indices.tolist()
+        pairs.update((min(photo, other), max(photo, other)) for other in best)
+    return pairs
+
+
+def vlad_descriptors(
+    count: int, read_descriptors: Callable[[int], Shaped[np.ndarray, "F 128"]], seed: int = 0
+) -> Float[Tensor, "N D"]:
+    """One unit vector a photo: SIFT residuals from the nearest words, normalised per word."""
+    generator = torch.Generator().manual_seed(seed)
+    share = max(1, VLAD_TRAINING // max(count, 1))
+    training = []
+    for photo in range(count):
+        features = _root_sift(read_descriptors(photo))
+        training.append(features[torch.randperm(len(features), generator=generator)[:share]])
+    samples = torch.cat(training)
+    words = _k_means(samples, min(VLAD_WORDS, max(len(samples), 1)), generator)
+    return torch.stack([_vlad(_root_sift(read_descriptors(photo)), words) for photo in range(count)])
+
+
+def _root_sift(descriptors: Shaped[np.ndarray, "F 128"]) -> Float[Tensor, "G 128"]:
+    features = torch.from_numpy(np.ascontiguousarray(descriptors[:VLAD_FEATURES])).to(torch.float32)
+    return torch.nn.functional.normalize(features, dim=1)
+
+
+def _k_means(
+    samples: Float[Tensor, "S 128"], words: int, generator: torch.Generator, rounds: int = 12
+) -> Float[Tensor, "K 128"]:
+    if len(samples) == 0:
+        return torch.zeros(1, 128)
+    centres = samples[torch.randperm(len(samples), generator=generator)[:words]].clone()
+    for _ in range(rounds):
+        nearest = _nearest_word(samples, centres)
+        sums = torch.zeros_like(centres).index_add_(0, nearest, samples)
+        counts = torch.bincount(nearest, minlength=len(centres))
+        centres = torch.where(counts[:, None] > 0, sums / counts.clamp_min(1)[:, None], centres)
+    return centres
+
+
+def _nearest_word(features: Float[Tensor, "F 128"], words: Float[Tensor, "K 128"]) -> Shaped[Tensor, "F"]:
+    chunks = [torch.cdist(chunk, words).argmin(dim=1) for chunk in features.split(16_384)]
+    return torch.cat(chunks) if chunks else torch.zeros(0, dtype=torch.int64)
+
+
+def _vlad(features: Float[Tensor, "F 128"], words: Float[Tensor, "K 128"]) -> Float[Tensor, "D"]:
+    residuals = torch.zeros_like(words)
+    if len(features):
+        nearest = _nearest_word(features, words)
+        residuals.index_add_(0, nearest, features - words[nearest])
+    per_word = torch.nn.functional.normalize(residuals, dim=1)
+    return torch.nn.functional.normalize(per_word.flatten(), dim=0)
+
+
+def near_pairs(
+    positions: Mapping[int, tuple[float, float]], neighbours: int, max_distance: float
+) -> set[tuple[int, int]]:
+    """Photos with those taken nearest to them.
+
+    Args:
+        positions: Latitude and longitude in degrees, of the photos that carry them.
+        neighbours: Partners looked up for each photo.
+        max_distance: Photos farther apart than this, in metres, are no partners.
+    """
+    photos = sorted(positions)
+    if len(photos) < 2:
+        return set()
+    # On the sphere the chord stands for the distance: no seam at the date line, none at the poles.
+    angles = np.radians(np.array([positions[photo] for photo in photos], dtype=np.float64))
+    latitude, longitude = angles[:, 0], angles[:, 1]
+    places = EARTH_RADIUS * np.stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
+    )
+    distances, partners = cKDTree(places).query(places, k=min(neighbours + 1, len(photos)))
+    pairs = set()
+    for row, photo in enumerate(photos):
+        for distance, partner in zip(distances[row], partners[row], strict=True):
+            other = photos[int(partner)]
+            if other != photo and distance <= max_distance:
+                pairs.add((min(photo, other), max(photo, other)))
+    return pairs
+
+
+def choose_pairs(
+    count: int,
+    read_descriptors: Callable[[int], Shaped[np.ndarray, "F 128"]],
+    positions: Mapping[int, tuple[float, float]],
+    config: PairingConfig,
+    seed: int = 0,
+) -> Pairing:
+    """All pairs of a small set; of a large one each photo's neighbours by GPS or by looks.
+
+    With GPS, a quarter of the partners still come by looks, because photos of one building from two squares
+    are neighbours in no other way; photos without a near neighbour get all of theirs so.
+
+    Args:
+        count: Number of photos.
+        read_descriptors: SIFT descriptors of a photo, the most reliable first (COLMAP sorts by scale); may be
+            empty.
+        positions: Latitude and longitude in degrees of the photos that carry them.
+        config: Limits.
+        seed: Of the training of the visual words.
+    """
+    if count <= config.exhaustive_limit:
+        return exhaustive_pairs(count)
+    near: set[tuple[int, int]] = set()
+    if len(positions) >= config.gps_share * count:
+        near = near_pairs(positions, config.neighbours, config.gps_distance)
+    placed = {photo for pair in near for photo in pair}
+    partners = {
+        photo: max(1, config.neighbours // 4) if photo in placed else config.neighbours
+        for photo in range(count)
+    }
+    alike = alike_pairs(vlad_descriptors(count, read_descriptors, seed), partners)
+    return Pairing("gps" if near else "retrieval", tuple(sorted(near | alike)))
