@@ -1,0 +1,95 @@
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from wildgs.cli import doctor
+from wildgs.cli.doctor import Check, Command, examine, run
+from wildgs.evaluation.lpips_weights import ENVIRONMENT
+
+
+@pytest.fixture(autouse=True)
+def empty_caches(monkeypatch, tmp_path):
+    """Caches of weights that hold nothing, whatever this machine has."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+
+
+def by_name() -> dict[str, Check]:
+    return {check.name: check for check in examine()}
+
+
+def test_what_every_installation_has_works():
+    checks = by_name()
+    for name in ("Python", "PyTorch", "CPU", "Numba", "rasteriser on the CPU", "poses from photos"):
+        assert checks[name].state == "works", checks[name]
+    assert "layer" in checks["Numba"].detail
+
+
+def test_missing_weights_come_with_the_command_that_gets_them():
+    checks = by_name()
+    assert checks["encoder weights"].state == "missing"
+    assert checks["encoder weights"].remedy == "hf download microsoft/resnet-18"
+    assert checks["depth weights"].state == "missing"
+    assert checks["depth weights"].remedy == "hf download depth-anything/Depth-Anything-V2-Small-hf"
+    assert checks["LPIPS weights"].state == "missing"
+    assert "alexnet-owt-7be5be79.pth" in (checks["LPIPS weights"].remedy or "")
+
+
+def test_cached_weights_are_seen(monkeypatch, tmp_path):
+    repository = tmp_path / "hub" / "models--microsoft--resnet-18"
+    snapshot = repository / "snapshots" / ("a" * 40)
+    snapshot.mkdir(parents=True)
+    (snapshot / "model.safetensors").write_bytes(b"weights")
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("a" * 40)
+    assert by_name()["encoder weights"].state == "works"
+
+
+def test_broken_lpips_weights_are_broken(monkeypatch, tmp_path):
+    (tmp_path / "alexnet.pth").write_bytes(b"no weights")
+    (tmp_path / "alex.pth").write_bytes(b"no weights")
+    monkeypatch.setenv(ENVIRONMENT, str(tmp_path))
+    check = by_name()["LPIPS weights"]
+    assert check.state == "broken"
+    assert "alexnet.pth" in check.detail
+
+
+def test_a_check_that_fails_does_not_stop_the_others(monkeypatch):
+    def fail() -> Check:
+        raise OSError("the library is gone\nwith details")
+
+    monkeypatch.setattr(doctor, "_pycolmap", fail)
+    checks = by_name()
+    assert checks["poses from photos"].state == "broken"
+    assert checks["poses from photos"].detail == "OSError: the library is gone"
+    assert checks["Python"].state == "works"
+
+
+def test_table_shows_remedies_unbroken(capsys, monkeypatch):
+    remedy = "hf download " + "x" * 200
+    monkeypatch.setattr(
+        doctor, "examine", lambda: [Check("encoder weights", "missing", "[odd] detail", remedy)]
+    )
+    run(Command())
+    printed = capsys.readouterr().out
+    assert remedy in printed
+    assert "[odd] detail" in printed
+
+
+def test_json_from_the_command_line(tmp_path):
+    environment = {**os.environ, "TORCH_HOME": str(tmp_path), "HF_HOME": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", "from wildgs.cli import main; main(['doctor', '--json'])"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert {entry["state"] for entry in report} <= {"works", "missing", "broken"}
+    assert {"name", "state", "detail", "remedy"} == set(report[0])
