@@ -30,11 +30,13 @@ class Painter(Method):
         self.paint = paint
         self.mask = mask
         self.shown: list[tuple[torch.Tensor, Camera]] = []
+        self.keeps: list[torch.Tensor | None] = []
 
-    def encode(self, photo, camera):
+    def encode(self, photo, camera, keep=None):
         assert not self.training
         assert not torch.is_grad_enabled()
         self.shown.append((photo, camera))
+        self.keeps.append(keep)
         return Appearance(visibility=photo[..., 0].clone() if self.mask else None)
 
     def shade(self, appearance, rows=None):
@@ -195,6 +197,18 @@ def test_ignored_pixels_do_not_count(tmp_path):
     )
     assert content["mean"]["psnr"] == 100
     assert any("mask ignores" in note for note in content["notes"])
+
+
+def test_encoding_gets_the_mask_of_what_it_sees(tmp_path):
+    mask = torch.full((H, W), 255, dtype=torch.uint8)
+    mask[:10, :5] = 0
+    whole, half = Painter(lambda p: p), Painter(lambda p: p[:, :1].expand(H, W, 3))
+    evaluate(whole, scene(view("a.jpg", mask=mask)), "full", tmp_path, step=1)
+    evaluate(half, scene(view("a.jpg", mask=mask)), "half", tmp_path, step=1)
+    assert whole.keeps[0] is not None
+    assert torch.equal(whole.keeps[0], mask > 0)
+    assert half.keeps[0] is not None
+    assert torch.equal(half.keeps[0], mask[:, : W // 2] > 0)
 
 
 def test_a_view_with_nothing_to_score_is_null_and_left_out_of_the_mean(tmp_path):

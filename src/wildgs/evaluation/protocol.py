@@ -142,11 +142,12 @@ def _inference(method: Method) -> Iterator[None]:
 
 def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
     """Harmonics under the view's own light, as far as the protocol shows it."""
-    photo, camera = _read_photo(view, device), view.camera.to(device)
+    photo, camera, keep = _read_photo(view, device), view.camera.to(device), _read_keep(view, device)
     if protocol == "half":
         half = photo.shape[1] // 2
         photo, camera = photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height)
-    return method.shade(method.encode(photo, camera))
+        keep = None if keep is None else keep[:, :half].contiguous()
+    return method.shade(method.encode(photo, camera, keep))
 
 
 def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Notes) -> UInt8[Tensor, "H W 3"]:
