@@ -16,6 +16,11 @@ from wildgs.geometry.camera import Camera
 
 BackendName = Literal["cpu", "cuda", "reference"]
 
+DILATION = 0.3  # px^2 added to the 2D covariance's diagonal (gsplat's eps2d): nothing is thinner than a pixel
+MIN_ALPHA = 1.0 / 255.0  # a Gaussian is dropped at a pixel where its alpha is below
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave no more light than this ends the pixel and is dropped
+
 
 @dataclass
 class Projection:
@@ -28,7 +33,8 @@ class Projection:
         depths: Camera-space z of the centres, world units. Differentiable.
         conics: Inverse of the dilated 2D covariances (xx, xy, yy), in 1/pixel^2. Differentiable.
         opacities: As given. Differentiable.
-        radii: Reach in pixels; 0 where the Gaussian is not seen (culled).
+        radii: Reach in pixels, rounded up: where alpha falls to 1/255 along the wider image axis (gsplat 1.5's
+            opacity-aware radius, its larger one); 0 where the Gaussian is not seen (culled).
         backend: Which backend made it, and must blend it.
         tiles: The backend's own tile lists, opaque to callers.
         absgrad: Where `blend`'s backward pass adds |d loss / d means2d| per pixel, summed (gsplat's `absgrad`);
@@ -57,7 +63,8 @@ class Rendering:
 
     Attributes:
         colors: Σ c_i α'_i T_i (+ background · (1 - alpha)).
-        depth: Expected depth Σ d_i α'_i T_i / alpha in world units (gsplat's "ED"); 0 where alpha is 0.
+        depth: Expected depth Σ d_i α'_i T_i / alpha in world units (gsplat's "ED"); 0 where alpha is 0, and
+            everywhere if `blend` was told to leave depth out.
         alpha: Σ α'_i T_i in [0, 1].
     """
 

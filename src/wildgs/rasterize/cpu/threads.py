@@ -1,0 +1,89 @@
+"""Runs a compiled kernel on several threads that draw work from one shared counter.
+
+A kernel releases the interpreter's lock and is called once per thread as `kernel(counter, *arguments)`; it takes
+work items with `fetch_add(counter, 1)` until none are left. What an item writes must not depend on who works on
+it, so results are the same for any number of threads. There is no global pool of Numba's in play: launches from
+several Python threads at once (autograd's backward thread, a viewer) are safe.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+
+from wildgs.errors import UserError
+
+_ANNOUNCE_AFTER = 1.0
+_announced = threading.Event()
+
+
+def thread_count() -> int:
+    """How many threads kernels run on: `WILDGS_NUM_THREADS`, else what torch uses.
+
+    Raises:
+        UserError: `WILDGS_NUM_THREADS` is not a positive whole number.
+    """
+    wish = os.environ.get("WILDGS_NUM_THREADS")
+    if wish is None:
+        return torch.get_num_threads()
+    if not wish.isdecimal() or int(wish) == 0:
+        raise UserError(
+            f"WILDGS_NUM_THREADS={wish!r} is not a positive whole number; set it to a count of threads"
+        )
+    return int(wish)
+
+
+@cache
+def _pool(process: int, workers: int) -> ThreadPoolExecutor:
+    """Helpers beside the calling thread; one pool a process, since threads do not survive a fork."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="wildgs-raster")
+
+
+def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = None) -> None:
+    """Calls the kernel on all threads and waits.
+
+    Args:
+        kernel: A compiled function `kernel(counter, *arguments)`.
+        arguments: Passed on.
+        items: Number of work items, where known: no more threads than that are started.
+    """
+    workers = thread_count() if items is None else max(1, min(thread_count(), items))
+    counter = np.zeros(1, np.int64)
+    if not getattr(kernel, "signatures", True):
+        announce_compilation(kernel, counter, *arguments)
+        return
+    if workers == 1:
+        kernel(counter, *arguments)
+        return
+    helpers = _pool(os.getpid(), workers - 1)
+    pending = [helpers.submit(kernel, counter, *arguments) for _ in range(workers - 1)]
+    kernel(counter, *arguments)
+    for job in pending:
+        job.result()
+
+
+def announce_compilation(kernel: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a kernel for the first time in this process, with a line on stderr where compiling takes long."""
+    timer = threading.Timer(_ANNOUNCE_AFTER, _announce)
+    timer.daemon = True
+    timer.start()
+    try:
+        return kernel(*arguments)
+    finally:
+        timer.cancel()
+
+
+def _announce() -> None:
+    if not _announced.is_set():
+        _announced.set()
+        print(
+            "wildgs: compiling the CPU rasteriser's kernels (once; kept on disk)", file=sys.stderr, flush=True
+        )

@@ -1,0 +1,244 @@
+"""The rasteriser that callers see: checks what comes in and hands it to a backend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.spherical_harmonics import num_sh_bases
+from wildgs.rasterize.interface import BackendName, Projection, Rendering
+
+
+def pick_backend(device: torch.device | str) -> BackendName:
+    """The backend that fits tensors on a device: `cuda` (gsplat) for CUDA, else `cpu`."""
+    return "cuda" if torch.device(device).type == "cuda" else "cpu"
+
+
+def _module(name: BackendName):
+    if name == "cpu":
+        from wildgs.rasterize.cpu import backend as module
+    elif name == "cuda":
+        from wildgs.rasterize import cuda as module
+    elif name == "reference":
+        from wildgs.rasterize import reference as module
+    else:
+        raise ValueError(f"there is no rasteriser backend {name!r}; choose 'cpu', 'cuda' or 'reference'")
+    return module
+
+
+def _check(
+    name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor, backend: BackendName
+) -> None:
+    """Shape (None: any size), device and number type of an input."""
+    fits = tensor.dim() == len(shape) and all(
+        s in (None, t) for s, t in zip(shape, tensor.shape, strict=True)
+    )
+    if not fits:
+        wanted = ", ".join("*" if s is None else str(s) for s in shape)
+        raise ValueError(f"{name} has shape {list(tensor.shape)}, expected [{wanted}]")
+    if tensor.dtype != like.dtype or tensor.device != like.device:
+        raise ValueError(
+            f"{name} is {tensor.dtype} on {tensor.device}, but the means are {like.dtype} on {like.device}"
+        )
+    if backend != "reference" and tensor.dtype != torch.float32:
+        raise ValueError(
+            f"{name} is {tensor.dtype}; the backend {backend!r} takes float32 ('reference' takes float64 too)"
+        )
+    if backend == "cpu" and tensor.device.type != "cpu":
+        raise ValueError(f"{name} is on {tensor.device}; the backend 'cpu' takes tensors in main memory")
+
+
+def project(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    camera: Camera,
+    *,
+    backend: BackendName | None = None,
+    near: float = 0.01,
+    absgrad: bool = False,
+) -> Projection:
+    """Projects Gaussians into a camera and sorts them into tiles, for any number of `blend` calls.
+
+    Semantics are those of gsplat 1.5's classic mode (`rasterize_mode="classic"`). Gaussians are culled (radius 0,
+    no gradient) that lie before the near plane, reach no pixel, have an opacity below 1/255, or hold a number that
+    is not finite.
+
+    Args:
+        means: Centres, world units.
+        quats: Orientations (wxyz), of any length but 0.
+        scales: Standard deviations along the own axes, world units, linear (no logarithm).
+        opacities: In [0, 1].
+        camera: The camera; no gradient flows to it.
+        backend: Which implementation; None takes `cuda` for tensors on CUDA and `cpu` otherwise.
+        near: Depth in world units up to which Gaussians are culled.
+        absgrad: Collect absolute screen gradients in `Projection.absgrad` during the backward pass.
+
+    Raises:
+        ValueError: Shapes, devices or number types do not fit, or there is no such backend.
+        UserError: The backend is not installed.
+    """
+    backend = backend or pick_backend(means.device)
+    module = _module(backend)
+    n = means.shape[0] if means.dim() else 0
+    for name, tensor, shape in (
+        ("means", means, (n, 3)),
+        ("quats", quats, (n, 4)),
+        ("scales", scales, (n, 3)),
+        ("opacities", opacities, (n,)),
+    ):
+        _check(name, tensor, shape, means, backend)
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"the camera's picture has no pixels: {camera.width} x {camera.height}")
+    return module.project(means, quats, scales, opacities, camera, near, absgrad)
+
+
+def blend(
+    projection: Projection,
+    colors: Float[Tensor, "N C"] | None,
+    *,
+    background: Float[Tensor, "C"] | None = None,
+    depth: bool = True,
+) -> Rendering:
+    """Blends values per Gaussian front to back over a projection's tile lists.
+
+    Gradients flow to the colours, the background and the projection's means2d, conics, depths and opacities.
+    Where nothing needs them (`torch.no_grad()`), nothing is kept for a backward pass.
+
+    Args:
+        projection: From `project`; may be blended several times.
+        colors: Any number of channels per Gaussian; None for depth and alpha alone.
+        background: Colour behind everything; black if None.
+        depth: Whether to blend expected depth too.
+
+    Raises:
+        ValueError: Shapes, devices or number types do not fit.
+    """
+    means2d = projection.means2d
+    if colors is None:
+        colors = means2d.new_zeros(len(means2d), 0)
+    _check("colors", colors, (len(means2d), None), means2d, projection.backend)
+    if background is not None:
+        _check("background", background, (colors.shape[1],), means2d, projection.backend)
+    return _module(projection.backend).blend(projection, colors, background, depth)
+
+
+def sh_to_colors(
+    means: Float[Tensor, "N 3"],
+    sh: Float[Tensor, "N K 3"],
+    camera: Camera,
+    *,
+    degree: int,
+    visible: Bool[Tensor, "N"] | None = None,
+) -> Float[Tensor, "N 3"]:
+    """Colours of Gaussians as a camera sees them: max(0, spherical harmonics + 0.5), as in 3DGS and gsplat.
+
+    Args:
+        means: Centres, world units; the direction is from the camera's centre to them. Differentiable.
+        sh: Coefficients, at least (degree + 1)^2 per channel; further ones are not used. Differentiable.
+        camera: The camera.
+        degree: 0 to 3.
+        visible: Others get colour 0 and no gradient (`Projection.visible`); None computes all.
+
+    Raises:
+        ValueError: Shapes or number types do not fit, or the degree is not supported.
+    """
+    backend = pick_backend(means.device)
+    bases = num_sh_bases(degree)
+    if backend == "cpu" and means.dtype == torch.float64:
+        backend = "reference"
+    _check("means", means, (None, 3), means, backend)
+    _check("sh", sh, (len(means), None, 3), means, backend)
+    if sh.shape[1] < bases:
+        raise ValueError(f"sh has {sh.shape[1]} coefficients per channel, degree {degree} needs {bases}")
+    if visible is not None and visible.shape != means.shape[:1]:
+        raise ValueError(f"visible has shape {list(visible.shape)}, expected [{len(means)}]")
+    module = _module("cpu" if backend == "cpu" else "reference")
+    return module.sh_to_colors(means, sh, camera, degree, visible)
+
+
+def rasterize(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    colors: Float[Tensor, "N C"] | Float[Tensor, "N K 3"],
+    camera: Camera,
+    *,
+    sh_degree: int | None = None,
+    background: Float[Tensor, "C"] | None = None,
+    backend: BackendName | None = None,
+    near: float = 0.01,
+    depth: bool = True,
+) -> Rendering:
+    """Renders Gaussians in one call: `project`, `sh_to_colors` where asked for, `blend`.
+
+    Args:
+        means: See `project`.
+        quats: See `project`.
+        scales: See `project`.
+        opacities: See `project`.
+        colors: Values per Gaussian, or spherical harmonics if `sh_degree` is given.
+        camera: The camera.
+        sh_degree: Degree at which to evaluate the harmonics; None takes colours as they are.
+        background: Colour behind everything; black if None.
+        backend: See `project`.
+        near: See `project`.
+        depth: Whether to blend expected depth too.
+
+    Raises:
+        ValueError: Shapes, devices or number types do not fit.
+        UserError: The backend is not installed.
+    """
+    projection = project(means, quats, scales, opacities, camera, backend=backend, near=near)
+    if sh_degree is not None:
+        colors = sh_to_colors(means, colors, camera, degree=sh_degree, visible=projection.visible)
+    return blend(projection, colors, background=background, depth=depth)
+
+
+@torch.no_grad()
+def render_uint8(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    colors: Float[Tensor, "N 3"] | Float[Tensor, "N K 3"],
+    cameras: Camera | Sequence[Camera],
+    *,
+    sh_degree: int | None = None,
+    background: Float[Tensor, "3"] | None = None,
+    backend: BackendName | None = None,
+) -> list[UInt8[Tensor, "_ _ 3"]]:
+    """Pictures for a viewer or a video: 8 bits, no depth, nothing kept for gradients.
+
+    Args:
+        means: See `rasterize`.
+        quats: See `rasterize`.
+        scales: See `rasterize`.
+        opacities: See `rasterize`.
+        colors: See `rasterize`; three channels in [0, 1].
+        cameras: One or several; their pictures may differ in size.
+        sh_degree: See `rasterize`.
+        background: See `rasterize`.
+        backend: See `project`.
+
+    Returns:
+        One picture per camera, on the tensors' device, values rounded to the nearest of 0 to 255.
+
+    Raises:
+        ValueError: Shapes, devices or number types do not fit.
+        UserError: The backend is not installed.
+    """
+    pictures = []
+    for camera in [cameras] if isinstance(cameras, Camera) else cameras:
+        rendering = rasterize(
+            means, quats, scales, opacities, colors, camera,
+            sh_degree=sh_degree, background=background, backend=backend, depth=False,
+        )  # fmt: skip
+        pictures.append(rendering.colors.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8))
+    return pictures
