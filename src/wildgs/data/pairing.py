@@ -88,7 +88,7 @@ def vlad_descriptors(
 
 
 def _root_sift(descriptors: Shaped[np.ndarray, "F 128"]) -> Float[Tensor, "G 128"]:
-    features = torch.from_numpy(np.ascontiguousarray(descriptors[:VLAD_FEATURES])).to(torch.float32)
+    features = torch.from_numpy(descriptors[:VLAD_FEATURES].astype(np.float32))
     return torch.nn.functional.normalize(features, dim=1)
 
 
