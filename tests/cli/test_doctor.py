@@ -26,7 +26,7 @@ def test_what_every_installation_has_works():
     checks = by_name()
     for name in ("Python", "PyTorch", "CPU", "Numba", "rasteriser on the CPU", "poses from photos"):
         assert checks[name].state == "works", checks[name]
-    assert "layer" in checks["Numba"].detail
+    assert "threads" in checks["Numba"].detail
 
 
 def test_missing_weights_come_with_the_command_that_gets_them():

@@ -112,20 +112,20 @@ def _cpu_model() -> str:
 
 
 def _numba() -> Check:
-    """Compiles and runs a parallel kernel, for only then is the thread layer known."""
+    """Compiles and runs a kernel, and compares."""
     import numba
     import torch
 
     from wildgs.losses.ssim import ssim
+    from wildgs.rasterize.cpu.threads import thread_count
 
     picture = torch.linspace(0, 1, 16 * 16 * 3).view(16, 16, 3)
     value = float(ssim(picture, picture))
     if abs(value - 1) > 1e-4:
-        return Check(
-            "Numba", "broken", f"{numba.__version__} computes {value} where 1 is right", _pip("numba", "-U")
-        )
-    layer = f"{numba.get_num_threads()} threads, layer {numba.threading_layer()}"
-    return Check("Numba", "works", f"{numba.__version__}, {layer}")
+        detail = f"{numba.__version__} computes {value} where 1 is right"
+        return Check("Numba", "broken", detail, _pip("numba", "-U"))
+    cores = f"kernels run on {thread_count()} threads (WILDGS_NUM_THREADS sets another number)"
+    return Check("Numba", "works", f"{numba.__version__}, {cores}")
 
 
 def _cpu_rasterizer() -> Check:

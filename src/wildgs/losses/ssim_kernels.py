@@ -1,14 +1,15 @@
 """Numba kernels of the structural similarity and its gradient.
 
 A picture is a matrix of H rows and L = W * C numbers (channels interleaved), so that one inner loop runs over
-all channels of a row and the horizontal window steps by C. Rows are independent, so results do not depend on
-the number of threads.
+all channels of a row and the horizontal window steps by C. A call does the rows from `first` to `last` and
+writes to no other, so calls for different rows may run at the same time, and results do not depend on how
+many there are.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 RADIUS = 5
 _MATHS = {"reassoc", "contract", "arcp", "nsz"}  # not nnan: a NaN must stay visible
@@ -33,8 +34,8 @@ def _filter_row(padded, taps, channels, out):
         out[j] = tails + wd * (d0[j] + d1[j]) + we * (e0[j] + e1[j]) + w * centre[j]
 
 
-@njit(parallel=True, fastmath=_MATHS, error_model="numpy", cache=True)
-def ssim_forward(x, y, taps, c1, c2, channels, derivatives, row_sums):
+@njit(nogil=True, fastmath=_MATHS, error_model="numpy", cache=True)
+def ssim_forward(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums):
     """Sum the SSIM map per row and keep its derivatives by the window's moments.
 
     With E the window's weighted mean, `derivatives` [4, H, L] takes those of ssim by E[x], E[y], E[x^2] (the
@@ -42,7 +43,7 @@ def ssim_forward(x, y, taps, c1, c2, channels, derivatives, row_sums):
     """
     height, length = x.shape
     pad = RADIUS * channels
-    for i in prange(height):
+    for i in range(first, last):
         sums = np.zeros((5, length + 2 * pad), dtype=x.dtype)
         sx, sy = sums[0, pad : pad + length], sums[1, pad : pad + length]
         sxx, syy, sxy = sums[2, pad : pad + length], sums[3, pad : pad + length], sums[4, pad : pad + length]
@@ -80,15 +81,15 @@ def ssim_forward(x, y, taps, c1, c2, channels, derivatives, row_sums):
         row_sums[i] = total
 
 
-@njit(parallel=True, fastmath=_MATHS, error_model="numpy", cache=True)
-def ssim_backward(x, y, taps, scale, channels, derivatives, grad_x, grad_y):
+@njit(nogil=True, fastmath=_MATHS, error_model="numpy", cache=True)
+def ssim_backward(first, last, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
     """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept.
 
     The window is symmetric, so the adjoint of filtering with zero padding is the same filtering.
     """
     height, length = x.shape
     pad = RADIUS * channels
-    for i in prange(height):
+    for i in range(first, last):
         sums = np.zeros((4, length + 2 * pad), dtype=x.dtype)
         s0, s1 = sums[0, pad : pad + length], sums[1, pad : pad + length]
         s2, s3 = sums[2, pad : pad + length], sums[3, pad : pad + length]
