@@ -136,7 +136,8 @@ def _viewmat(image: Any) -> np.ndarray:
 
 
 def _read_points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    items = list(reconstruction.points3D.items())
+    # By id: the order in pycolmap's hash map may differ from one machine to the next.
+    items = sorted(reconstruction.points3D.items())
     ids = np.array([point_id for point_id, _ in items], dtype=np.uint64)
     points = np.array([point.xyz for _, point in items], dtype=np.float64).reshape(-1, 3)
     colors = np.array([point.color for _, point in items], dtype=np.uint8).reshape(-1, 3)
