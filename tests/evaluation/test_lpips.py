@@ -1,3 +1,5 @@
+import threading
+import time
 import urllib.error
 
 import numpy as np
@@ -122,6 +124,16 @@ def test_without_weights_the_download_is_tried_once(offline):
     assert len(offline) == 1
 
 
+def test_a_network_that_hangs_is_given_up(offline, monkeypatch):
+    release = threading.Event()
+    monkeypatch.setattr(lpips_weights, "_TIMEOUT_SECONDS", 0.1)
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: release.wait(30))
+    start = time.monotonic()
+    assert load_lpips()[0] is None
+    assert time.monotonic() - start < 5
+    release.set()
+
+
 def test_download_reads_weights_only_and_lands_in_the_cache(offline, tmp_path, monkeypatch):
     requests = []
 
@@ -131,7 +143,7 @@ def test_download_reads_weights_only_and_lands_in_the_cache(offline, tmp_path, m
         save_random_weights("alex", tmp_path / "remote", "alexnet-owt-7be5be79.pth", "alex.pth")
         checkpoints.mkdir(parents=True, exist_ok=True)
         name = url.rsplit("/", 1)[1]
-        (checkpoints / (file_name or name)).write_bytes((tmp_path / "remote" / name).read_bytes())
+        (checkpoints / file_name).write_bytes((tmp_path / "remote" / name).read_bytes())
 
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", serve)
     model, _ = load_lpips()

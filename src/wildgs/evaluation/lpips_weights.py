@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -134,24 +135,26 @@ def _package_folders() -> list[Path]:
 @cache
 def _download() -> LpipsFiles | None:
     """The official AlexNet weights into torch's hub cache; None where they cannot be reached. Tried once."""
+    # The small file first, and aside: looking up a name has no timeout of its own.
+    small = threading.Thread(target=_fetch, args=(_LINEAR_URL + "alex.pth", "lpips_alex.pth"), daemon=True)
+    small.start()
+    small.join(_TIMEOUT_SECONDS)
+    if small.is_alive() or not (_hub_folder() / "lpips_alex.pth").is_file():
+        return None
+    _fetch(_BACKBONE_URL + OFFICIAL["alex"], OFFICIAL["alex"])
+    return find_lpips()
+
+
+def _fetch(url: str, name: str) -> None:
+    """Downloads a file into the hub cache; leaves nothing there where that fails."""
+    hashed = name == OFFICIAL["alex"]
     try:
         with _socket_timeout(_TIMEOUT_SECONDS):
-            # The small file first: without a network nothing waits for the large one.
-            for url, name in (
-                (_LINEAR_URL + "alex.pth", "lpips_alex.pth"),
-                (_BACKBONE_URL + OFFICIAL["alex"], None),
-            ):
-                torch.hub.load_state_dict_from_url(
-                    url,
-                    map_location="cpu",
-                    progress=False,
-                    check_hash=name is None,
-                    file_name=name,
-                    weights_only=True,
-                )
+            torch.hub.load_state_dict_from_url(
+                url, map_location="cpu", progress=hashed, check_hash=hashed, file_name=name, weights_only=True
+            )
     except Exception:  # urllib, ssl, socket, unpickling and hash errors alike mean that there are no weights
-        return None
-    return find_lpips()
+        return
 
 
 @contextmanager
