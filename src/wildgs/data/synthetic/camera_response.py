@@ -43,7 +43,7 @@ def draw_response(rng: np.random.Generator, *, dark: bool) -> CameraResponse:
 
 
 def metered_gain(radiance: Float[np.ndarray, "H W 3"]) -> float:
-    """Gain that brings the picture to a middle brightness, weighted to the centre as a camera's meter does."""
+    """Gain that brings the picture to a middle brightness, weighted to the centre as a meter does."""
     height, width = radiance.shape[:2]
     y, x = np.mgrid[:height, :width]
     weight = np.exp(-2.0 * ((x / width - 0.5) ** 2 + (y / height - 0.55) ** 2) / 0.3)

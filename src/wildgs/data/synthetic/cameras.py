@@ -69,7 +69,7 @@ def draw_viewpoint(share: float, long_side: int, rng: np.random.Generator) -> Vi
         long_side: Longer side of the photo in pixels.
         rng: Randomness of this photo.
     """
-    angle = np.deg2rad(-100.0 + 200.0 * share)
+    angle = np.deg2rad(-92.0 + 184.0 * share)
     distance = rng.uniform(19.0, 36.0) - 5.0 * (np.abs(share - 0.5) > 0.38)
     raised = rng.uniform() < 0.18
     height = rng.uniform(5.0, 11.0) if raised else rng.uniform(1.5, 1.8)

@@ -152,8 +152,8 @@ def _dome(solids: Solids) -> None:
     solids.frustum((0.0, 0.0, 0.5), (3.75, 3.75), 3.2, material=ASHLAR, color=LIMESTONE)
     for i in range(12):
         turn = 30.0 * i
-        _window(solids.frame(yaw=turn).frame((0.0, -3.68, 1.05)), 0.42, 1.85)
-        pillar = solids.frame(yaw=turn + 15.0).frame((0.0, -3.85, 0.5))
+        _window(solids.frame(yaw=turn).frame((0.0, -3.78, 1.05)), 0.42, 1.85)
+        pillar = solids.frame(yaw=turn + 15.0).frame((0.0, -3.88, 0.5))
         pillar.frustum((0.0, 0.0, 0.0), (0.21, 0.19), 2.9, material=COLUMN, color=PALE)
         pillar.frustum((0.0, 0.0, 2.9), (0.19, 0.3), 0.3, material=PLAIN, color=PALE)
     solids.frustum((0.0, 0.0, 3.7), (4.15, 4.3), 0.3, material=PLAIN, color=PALE)

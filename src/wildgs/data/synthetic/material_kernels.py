@@ -142,8 +142,8 @@ def ornament(u, v, height, r, g, b):
 def albedo(kind, size, base, x, y, z, nx, ny, nz, wx, wy, wz, blur):
     """Colour (r, g, b), emission under evening light and mirror-like share at a point of a solid.
 
-    The point is given in own coordinates (x, y, z) with its own normal and in the world's (wx, wy, wz); `size` and
-    `base` are the solid's size and colour, `blur` is the width of a pixel there in metres.
+    The point is given in own coordinates (x, y, z) with its own normal and in the world's (wx, wy, wz);
+    `size` and `base` are the solid's size and colour, `blur` is the width of a pixel there in metres.
     """
     r, g, b = base[0], base[1], base[2]
     glow, mirror = 0.0, 0.0
@@ -205,8 +205,8 @@ def albedo(kind, size, base, x, y, z, nx, ny, nz, wx, wy, wz, blur):
         stain = 0.74 + 0.5 * fractal(wx * 0.55, wy * 0.55, 0.5, 4)
         stain *= 0.93 + 0.14 * noise(wx * 6.0, wy * 6.0, 0.5)
     elif kind == LEAVES:
-        leaf = fractal(wx * 3.2, wy * 3.2, wz * 3.2, 3)
-        stain = 0.35 + 1.25 * leaf * leaf + 0.25 * noise(wx * 9.0, wy * 9.0, wz * 9.0)
+        leaf = fractal(wx * 4.2, wy * 4.2, wz * 4.2, 3)
+        stain = 0.25 + 1.9 * leaf * leaf
         r *= 0.8 + 0.5 * noise(wx * 0.9, wy * 0.9, wz * 0.9)
     elif kind in (GRASS, HILL):
         scale = 0.5 if kind == GRASS else 0.045
@@ -227,7 +227,7 @@ def albedo(kind, size, base, x, y, z, nx, ny, nz, wx, wy, wz, blur):
         if min(across, up) < 0.035:
             r, g, b = 0.22, 0.19, 0.16
         else:
-            mirror, glow = 0.32, 1.0
+            mirror, glow = 0.32, 0.75
             pane = 0.75 + 0.5 * hash3(np.int64(np.floor(u / 0.42)), np.int64(np.floor(v / 0.6)), 2)
             r, g, b = r * pane, g * pane, b * pane
     elif kind == WATER:
@@ -257,7 +257,7 @@ def albedo(kind, size, base, x, y, z, nx, ny, nz, wx, wy, wz, blur):
         r, g, b = bus_side(x, y, z, size, nx, ny, r, g, b)
         mirror = 0.12
     elif kind == LAMP:
-        glow = 5.0
+        glow = 1.7
     elif kind == WOOD:
         u, v = face_coordinates(x, y, z, nx, ny, nz)
         plank = u / 0.3 - np.floor(u / 0.3)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numba import parallel_chunksize
 
 from wildgs.data.synthetic.cameras import Viewpoint
 from wildgs.data.synthetic.lighting import Light
@@ -54,7 +55,7 @@ def render(
         light: Sun, sky and lamps of this photo.
         view: The camera.
         per_pixel: Samples per pixel along each axis.
-        seed: Randomness of the light's sampling; with equal seeds, what visitors do not touch comes out equal.
+        seed: Randomness of the light's sampling; equal seeds give equal grain where no visitor is.
     """
     camera = (
         view.position,
@@ -65,16 +66,18 @@ def render(
         view.height,
     )
     vector = light.vector()
-    samples = render_samples(place.arrays, visitors.arrays, vector, lamps, *camera, per_pixel, seed)
-    smooth = np.empty((*samples.shape[:2], 3), dtype=samples.dtype)
-    for spacing in (1, 2, 4, 8):
-        smooth_indirect(samples, spacing, smooth)
-        samples[..., :3] = smooth
-    samples = samples.astype(np.float64)
+    # Rows differ in cost and cores may be busy: small portions keep all threads at work to the end.
+    with parallel_chunksize(8):
+        samples = render_samples(place.arrays, visitors.arrays, vector, lamps, *camera, per_pixel, seed)
+        smooth = np.empty((*samples.shape[:2], 3), dtype=samples.dtype)
+        for spacing in (1, 2, 4):
+            smooth_indirect(samples, spacing, smooth)
+            samples[..., :3] = smooth
+            samples[..., 14] = 1.0
     radiance = samples[..., :3] * samples[..., 3:6] + samples[..., 6:9]
     distance = samples[..., 12:13]
     clear = np.where(distance > 0.0, np.exp(-distance / HAZE), 1.0)
-    radiance = radiance * clear + vector[HORIZON : HORIZON + 3] * (1.0 - clear)
+    radiance = radiance * clear + vector[HORIZON : HORIZON + 3].astype(np.float32) * (1.0 - clear)
     depth, what = depth_and_kind(place.arrays, visitors.arrays, *camera)
     visitor = (_pool(samples[..., 13:14], per_pixel)[..., 0] > 0.0) | (what == 1)
     return Rendered(_pool(np.minimum(radiance, 8.0), per_pixel), depth, visitor)
@@ -83,7 +86,7 @@ def render(
 def _pool(samples: Float[np.ndarray, "h w c"], per_pixel: int) -> Float[np.ndarray, "H W c"]:
     rows, columns, channels = samples.shape
     grid = samples.reshape(rows // per_pixel, per_pixel, columns // per_pixel, per_pixel, channels)
-    return grid.mean(axis=(1, 3))
+    return grid.mean(axis=(1, 3), dtype=np.float64)
 
 
 def visible_share(landmark: World, around: World, view: Viewpoint) -> float:

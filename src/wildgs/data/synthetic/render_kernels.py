@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
-from wildgs.data.synthetic.material_kernels import GLASS, LAMP, LEAVES, PAVING, albedo
+from wildgs.data.synthetic.material_kernels import LAMP, LEAVES, METAL, PAVING, albedo
 from wildgs.data.synthetic.sky_kernels import HORIZON, LAMPS, SUN, SUN_COLOR, hash3, noise, sky
 from wildgs.data.synthetic.tracer_kernels import (
     FAR,
@@ -16,7 +16,7 @@ from wildgs.data.synthetic.tracer_kernels import (
 )
 
 HAZE = 520.0  # metres over which air hides 63 % of what lies behind it
-LAMP_COLOR = (1.0, 0.62, 0.28)
+LAMP_COLOR = (1.0, 0.6, 0.24)
 EPSILON = 2e-3
 
 
@@ -105,10 +105,8 @@ def bounce(place, visitors, light, px, py, pz, dx, dy, dz, u, v, stack):
     if i < 0:
         return sky(light, dx, dy, dz, False)
     qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
-    if who == 1:
-        nx, ny, nz, r, g, b, glow, _, _ = surface(visitors, i, qx, qy, qz, dx, dy, dz, 1.0)
-    else:
-        nx, ny, nz, r, g, b, glow, _, _ = surface(place, i, qx, qy, qz, dx, dy, dz, 1.0)
+    world = visitors if who == 1 else place
+    nx, ny, nz, r, g, b, glow, _, _ = surface(world, i, qx, qy, qz, dx, dy, dz, 1.0)
     qx, qy, qz = qx + EPSILON * nx, qy + EPSILON * ny, qz + EPSILON * nz
     sun = sunlight(place, visitors, light, qx, qy, qz, nx, ny, nz, u, v, stack)
     fill = 0.22 + 0.28 * max(nz, 0.0)
@@ -123,7 +121,7 @@ def bounce(place, visitors, light, px, py, pz, dx, dy, dz, u, v, stack):
 @jit
 def ruffle(kind, x, y, z, nx, ny, nz):
     """The normal of a rough surface."""
-    amount, scale = (0.75, 2.6) if kind == LEAVES else ((0.05, 2.0) if kind == PAVING else (0.0, 1.0))
+    amount, scale = (1.1, 5.0) if kind == LEAVES else ((0.05, 2.0) if kind == PAVING else (0.0, 1.0))
     if amount == 0.0:
         return nx, ny, nz
     nx += amount * (noise(x * scale, y * scale, z * scale) - 0.5) * 2.0
@@ -138,7 +136,8 @@ def shade_sample(place, visitors, light, lamps, origin, dx, dy, dz, spread, seed
     """Fills one sample of the buffers.
 
     `out`: 0-2 light from the sky and one bounce, 3-5 colour, 6-8 other light, 9-11 normal, 12 distance
-    (0 = sky), 13 whether a visitor.
+    (0 = sky), 13 whether a visitor, 14 whether 0-2 are known: every other sample, as on a chessboard; the
+    filter fills in the rest.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
     t, i, who = first_hit(place, visitors, ox, oy, oz, dx, dy, dz, 1e-3, stack)
@@ -146,17 +145,16 @@ def shade_sample(place, visitors, light, lamps, origin, dx, dy, dz, spread, seed
         out[6], out[7], out[8] = sky(light, dx, dy, dz, True)
         return
     px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
-    if who == 1:
-        nx, ny, nz, r, g, b, glow, mirror, kind = surface(visitors, i, px, py, pz, dx, dy, dz, t * spread)
-    else:
-        nx, ny, nz, r, g, b, glow, mirror, kind = surface(place, i, px, py, pz, dx, dy, dz, t * spread)
+    world = visitors if who == 1 else place
+    nx, ny, nz, r, g, b, glow, mirror, kind = surface(world, i, px, py, pz, dx, dy, dz, t * spread)
     out[3], out[4], out[5] = r * (1.0 - mirror), g * (1.0 - mirror), b * (1.0 - mirror)
     out[9], out[10], out[11], out[12], out[13] = nx, ny, nz, t, who
     px, py, pz = px + EPSILON * nx, py + EPSILON * ny, pz + EPSILON * nz
-    u, v = hash3(seed, x, 4 * y), hash3(seed, x, 4 * y + 1)
-    ax, ay, az = around(nx, ny, nz, u, v)
     a, c = hash3(seed, x, 4 * y + 2), hash3(seed, x, 4 * y + 3)
-    out[0], out[1], out[2] = bounce(place, visitors, light, px, py, pz, ax, ay, az, a, c, stack)
+    if (x + y) % 2 == 0:
+        ax, ay, az = around(nx, ny, nz, hash3(seed, x, 4 * y), hash3(seed, x, 4 * y + 1))
+        out[0], out[1], out[2] = bounce(place, visitors, light, px, py, pz, ax, ay, az, a, c, stack)
+        out[14] = 1.0
     mx, my, mz = ruffle(kind, px, py, pz, nx, ny, nz)
     sun = sunlight(place, visitors, light, px, py, pz, mx, my, mz, a, c, stack)
     warm = lamplight(place, visitors, light, lamps, px, py, pz, mx, my, mz, stack)
@@ -165,10 +163,9 @@ def shade_sample(place, visitors, light, lamps, origin, dx, dy, dz, spread, seed
         k = 2.0 * (dx * nx + dy * ny + dz * nz)
         rx, ry, rz = dx - k * nx, dy - k * ny, dz - k * nz
         er, eg, eb = bounce(place, visitors, light, px, py, pz, rx, ry, rz, a, c, stack)
-        if kind == GLASS or k == 0.0:
-            er, eg, eb = er * mirror, eg * mirror, eb * mirror
-        else:
-            er, eg, eb = er * mirror * (0.4 + r), eg * mirror * (0.4 + g), eb * mirror * (0.4 + b)
+        er, eg, eb = er * mirror, eg * mirror, eb * mirror
+        if kind == METAL:
+            er, eg, eb = er * (0.4 + r), eg * (0.4 + g), eb * (0.4 + b)
     glow *= light[LAMPS]
     if kind == LAMP:
         glow += 0.25
@@ -183,7 +180,7 @@ def render_samples(
 ):
     """Buffers of `shade_sample` on a grid of per_pixel x per_pixel samples a pixel."""
     rows, columns = height * per_pixel, width * per_pixel
-    buffers = np.zeros((rows, columns, 14), dtype=np.float32)
+    buffers = np.zeros((rows, columns, 15), dtype=np.float32)
     for y in prange(rows):
         stack = np.empty(STACK, dtype=np.int64)
         for x in range(columns):
@@ -234,6 +231,22 @@ def depth_and_kind(place, visitors, origin, to_world, focal, center, width, heig
 
 
 @jit
+def nearby_indirect(buffers, x, y):
+    """Mean of what is known beside a sample that has no known neighbour on its own surface."""
+    r, g, b, total = 0.0, 0.0, 0.0, 1e-6
+    for v in range(max(y - 1, 0), min(y + 2, buffers.shape[0])):
+        for u in range(max(x - 1, 0), min(x + 2, buffers.shape[1])):
+            there = buffers[v, u]
+            r, g, b, total = (
+                r + there[14] * there[0],
+                g + there[14] * there[1],
+                b + there[14] * there[2],
+                total + there[14],
+            )
+    return r / total, g / total, b / total
+
+
+@jit
 def smoothed(buffers, x, y, spacing):
     """Light from sky and bounce at a sample, averaged over its neighbours on the same surface."""
     rows, columns = buffers.shape[0], buffers.shape[1]
@@ -253,13 +266,15 @@ def smoothed(buffers, x, y, spacing):
                 continue
             gap = (there[12] - here[12]) / (0.02 * here[12] * spacing)
             near = (0.375 if i == 0 else 0.5 / 2.0 ** abs(i)) * (0.375 if j == 0 else 0.5 / 2.0 ** abs(j))
-            weight = near * alike**12 / (1.0 + gap * gap)
+            weight = there[14] * near * alike**12 / (1.0 + gap * gap)
             r, g, b, total = (
                 r + weight * there[0],
                 g + weight * there[1],
                 b + weight * there[2],
                 total + weight,
             )
+    if total <= 0.0:
+        return nearby_indirect(buffers, x, y)
     return r / total, g / total, b / total
 
 

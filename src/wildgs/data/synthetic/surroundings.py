@@ -42,7 +42,9 @@ def add_surroundings(solids: Solids, rng: np.random.Generator) -> None:
     """Ground, furniture and background."""
     solids.box((0.0, 0.0, -1.2), (900.0, 900.0), 1.1, material=GRASS, color=(0.20, 0.28, 0.09))
     square = solids.frame((*FOUNTAIN, -0.5))
-    square.frustum((0.0, 0.0, 0.0), (SQUARE_RADIUS,) * 2, 0.5, material=PAVING, color=(0.50, 0.46, 0.41))
+    square.frustum(
+        (0.0, 0.0, 0.0), (SQUARE_RADIUS, SQUARE_RADIUS), 0.5, material=PAVING, color=(0.50, 0.46, 0.41)
+    )
     _fountain(solids.frame((*FOUNTAIN, 0.0)))
     for x, y in _LAMPS:
         _lamp(solids.frame((x, y, 0.0)))
@@ -114,11 +116,11 @@ def _crown(
 
 def _trees(solids: Solids, rng: np.random.Generator) -> None:
     round_trees = (
-        (-15.5, 1.5, 1.15),
-        (-19.5, 6.0, 1.3),
-        (20.5, 5.0, 1.25),
-        (-22.5, -5.5, 1.0),
-        (24.0, -4.0, 1.05),
+        (-17.5, 4.5, 1.15),
+        (-22.0, 8.0, 1.3),
+        (22.5, 8.5, 1.25),
+        (-26.5, -1.5, 1.0),
+        (28.0, 0.5, 1.05),
     )
     for x, y, scale in round_trees:
         solids.frustum(

@@ -1,8 +1,8 @@
 """Ray casting of convex solids through a bounding volume hierarchy, in Numba (``njit``).
 
 A world is the tuple that ``solids.World.arrays`` gives: kind, pose, size, material, color, node boxes,
-node links, order. Every solid but the arch is convex, so that a ray meets it in one interval; an arch is a box
-without a convex opening.
+node links, order. Every solid but the arch is convex, so that a ray meets it in one interval; an arch is a
+box without a convex opening.
 """
 
 import numpy as np
