@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from wildgs.data.hub import hub_reachable
 from wildgs.errors import UserError, WildGSWarning
 
 if TYPE_CHECKING:
@@ -140,11 +140,11 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
         if list(resnet.config.hidden_sizes) != list(FEATURE_WIDTHS[1:]):
             raise UserError(f"{source} holds another network than ResNet-18; give the folder of {RESNET18}")
         return resnet
-    for offline in (True, False):
-        if not offline and os.environ.get("HF_HUB_OFFLINE", "0") not in ("", "0"):
+    for local in (True, False):
+        if not local and not hub_reachable():
             return None
         try:
-            return ResNetModel.from_pretrained(source, local_files_only=offline)
+            return ResNetModel.from_pretrained(source, local_files_only=local)
         except Exception:  # the hub's client raises many kinds of errors; all of them mean 'not to be had'
             continue
     return None
