@@ -1,0 +1,39 @@
+"""Colours for depth maps."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+# Nine entries of matplotlib's "inferno" (CC0), a map whose lightness grows evenly from black to pale yellow.
+_INFERNO = np.array(
+    [
+        (0, 0, 4),
+        (31, 12, 72),
+        (85, 15, 109),
+        (136, 34, 106),
+        (186, 54, 85),
+        (227, 89, 51),
+        (249, 140, 10),
+        (249, 201, 50),
+        (252, 255, 164),
+    ],
+    dtype=float,
+)
+_NO_DEPTH = (128, 128, 128)
+
+
+def color_depth(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Paints depths by their disparity: near is bright, far is dark, no depth (0 or not finite) is grey."""
+    known = np.isfinite(depth) & (depth > 0.0)
+    picture = np.empty((*depth.shape, 3), dtype=np.uint8)
+    picture[:] = _NO_DEPTH
+    if not known.any():
+        return picture
+    disparity = 1.0 / depth[known]
+    low, high = np.quantile(disparity, [0.01, 0.99])
+    share = np.clip((disparity - low) / max(high - low, 1e-12), 0.0, 1.0)
+    stops = np.linspace(0.0, 1.0, len(_INFERNO))
+    channels = [np.interp(share, stops, _INFERNO[:, c]) for c in range(3)]
+    picture[known] = np.stack(channels, axis=-1).round().astype(np.uint8)
+    return picture
