@@ -23,10 +23,14 @@ class MixedModule(nn.Module):
 
 
 def set_precision(module: nn.Module, precision: torch.dtype) -> None:
-    """Sets the precision of all networks inside a module."""
+    """Sets the precision of all networks inside a module.
+
+    Convolutions are laid out channels-last, which is faster for both precisions on CPUs and tensor cores.
+    """
     for part in module.modules():
         if isinstance(part, MixedModule):
             part.precision = precision
+            part.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def choose_precision(wish: Precision, device: torch.device) -> torch.dtype:
