@@ -36,9 +36,9 @@ class Command:
     """wildgs, or 3dgs for plain 3D Gaussian Splatting on the same engine."""
     resume: bool = False
     """Go on from the run's newest checkpoint, with the configuration it began with."""
-    data: Annotated[DataConfig, tyro.conf.arg(prefix_name=False)] = field(default_factory=DataConfig)
-    model: Annotated[WildGSConfig, tyro.conf.arg(prefix_name=False)] = field(default_factory=WildGSConfig)
-    train: Annotated[TrainConfig, tyro.conf.arg(prefix_name=False)] = field(default_factory=TrainConfig)
+    data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
+    model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
+    train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
 
 def run(command: Command) -> None:
