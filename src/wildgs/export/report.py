@@ -4,84 +4,25 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
 from wildgs.export.depth_colors import color_depth
+from wildgs.export.report_scores import MethodScores, scores_section
+
+__all__ = ["MethodScores", "Report", "ReportExample", "write_report"]
 
 Photo = UInt8[np.ndarray, "H W 3"]
 
 _QUALITY = 88
-_DASH = "–"
-_METRICS = (("psnr", "PSNR (dB)", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3))
-_PROTOCOLS = {
-    "full": ("Whole photo", "the light is taken from the whole test photo, which is scored as a whole"),
-    "half": (
-        "Half photo",
-        "the light is taken from the left half of the test photo, the right half is scored",
-    ),
-}
-
-
-@dataclass(frozen=True)
-class MethodScores:
-    """Scores of one method.
-
-    Attributes:
-        name: Of the method.
-        scores: Per protocol ("full", "half"), the mean of each metric; None where it could not be computed.
-        steps: Training steps.
-        train_seconds: Training time.
-        num_gaussians: At the end of training.
-        render_fps: Frames per second.
-        device: On which it trained and rendered.
-        notes: What a reader of the scores has to know, such as why a metric is missing.
-    """
-
-    name: str
-    scores: Mapping[str, Mapping[str, float | None]]
-    steps: int | None = None
-    train_seconds: float | None = None
-    num_gaussians: int | None = None
-    render_fps: float | None = None
-    device: str = ""
-    notes: tuple[str, ...] = ()
-
-    @classmethod
-    def from_metrics(
-        cls, name: str, metrics: Mapping[str, Mapping[str, Any]], steps: int | None = None
-    ) -> MethodScores:
-        """Takes scores from the contents of `metrics.json` files.
-
-        Args:
-            name: Of the method.
-            metrics: Contents by protocol.
-            steps: Training steps; by default the step that the files state.
-        """
-        any_file: Mapping[str, Any] = next(iter(metrics.values()), {})
-        notes = [note for content in metrics.values() for note in _as_lines(content.get("notes"))]
-        return cls(
-            name=name,
-            scores={
-                protocol: {key: _as_float(content.get("mean", {}).get(key)) for key, _, _ in _METRICS}
-                for protocol, content in metrics.items()
-            },
-            steps=any_file.get("step") if steps is None else steps,
-            train_seconds=_as_float(any_file.get("train_seconds")),
-            num_gaussians=any_file.get("num_gaussians"),
-            render_fps=_as_float(any_file.get("render_fps")),
-            device=str(any_file.get("device") or ""),
-            notes=tuple(dict.fromkeys(notes)),
-        )
 
 
 @dataclass(frozen=True)
@@ -139,7 +80,7 @@ def write_report(report: Report, file: Path) -> None:
     page = Template(template).substitute(
         title=escape(report.title),
         summary=escape(report.summary),
-        scores=_scores(report.methods),
+        scores=scores_section(report.methods),
         examples=_examples(report.examples),
         footer="Written by Wild-GS. The pictures are part of this file; nothing is loaded from elsewhere.",
     )
@@ -147,93 +88,6 @@ def write_report(report: Report, file: Path) -> None:
     aside = file.with_name(f".{file.name}.part")
     aside.write_text(page, encoding="utf-8")
     aside.replace(file)
-
-
-def _as_float(value: Any) -> float | None:
-    return None if value is None else float(value)
-
-
-def _as_lines(notes: Any) -> Iterable[str]:
-    """Notes as lines, whether they were stored as one line, several, or by metric."""
-    if not notes:
-        return ()
-    if isinstance(notes, Mapping):
-        return tuple(f"{key}: {value}" for key, value in notes.items())
-    return (notes,) if isinstance(notes, str) else tuple(str(note) for note in notes)
-
-
-def _scores(methods: Sequence[MethodScores]) -> str:
-    if not methods:
-        return ""
-    protocols = [p for p in _PROTOCOLS if any(p in method.scores for method in methods)]
-    groups = "".join(f'<th colspan="3" scope="colgroup">{_PROTOCOLS[p][0]}</th>' for p in protocols)
-    columns = "".join(
-        f'<th scope="col"{_first(key)}>{label}</th>' for _ in protocols for key, label, _ in _METRICS
-    )
-    facts = "".join(
-        f'<th scope="col" rowspan="2"{" class=first" * (i == 0)}>{label}</th>'
-        for i, label in enumerate(("Steps", "Minutes", "Gaussians", "Frames/s"))
-    )
-    rows = "".join(_row(method, methods, protocols) for method in methods)
-    meaning = "; ".join(f"{_PROTOCOLS[p][0].lower()}: {_PROTOCOLS[p][1]}" for p in protocols)
-    hint = f"Means over the held-out photos ({escape(meaning)}). " if protocols else ""
-    return (
-        f'<section><h2>Scores</h2><p class="hint">{hint}Higher PSNR and SSIM, lower LPIPS are better.</p>'
-        '<div class="scroll" tabindex="0" role="region" aria-label="Table of scores"><table><thead>'
-        f'<tr><th scope="col" rowspan="2">Method</th>{groups}{facts}</tr><tr>{columns}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>{_notes(methods)}</section>"
-    )
-
-
-def _first(key: str) -> str:
-    return ' class="first"' if key == _METRICS[0][0] else ""
-
-
-def _row(method: MethodScores, methods: Sequence[MethodScores], protocols: Sequence[str]) -> str:
-    cells = [f'<th scope="row">{escape(method.name)}</th>']
-    for protocol in protocols:
-        for key, _, digits in _METRICS:
-            value = method.scores.get(protocol, {}).get(key)
-            names = [name for name, on in (("first", key == "psnr"), ("best", False)) if on]
-            if value is not None and _is_best(value, key, protocol, methods):
-                names.append("best")
-            label = "not computed, see the notes" if value is None else f"{value:.{digits}f}"
-            shown = f'<span role="img" aria-label="{label}">{_DASH}</span>' if value is None else label
-            cells.append(f'<td class="{" ".join(names)}">{shown}</td>')
-    minutes = None if method.train_seconds is None else method.train_seconds / 60.0
-    facts = (
-        _number(method.steps, 0),
-        _number(minutes, 1),
-        _number(method.num_gaussians, 0),
-        _number(method.render_fps, 1),
-    )
-    cells += [f'<td class="{"first" * (i == 0)}">{fact}</td>' for i, fact in enumerate(facts)]
-    return f"<tr>{''.join(cells)}</tr>"
-
-
-def _is_best(value: float, key: str, protocol: str, methods: Sequence[MethodScores]) -> bool:
-    """Whether no other method has a better value; with nothing to compare, none is best."""
-    values = [method.scores.get(protocol, {}).get(key) for method in methods]
-    known = [v for v in values if v is not None]
-    return len(known) > 1 and value == (min(known) if key == "lpips" else max(known))
-
-
-def _number(value: float | int | None, digits: int) -> str:
-    return _DASH if value is None else f"{value:,.{digits}f}"
-
-
-def _notes(methods: Sequence[MethodScores]) -> str:
-    """Notes below the table; those that all methods share are said once."""
-    by_note: dict[str, list[str]] = {}
-    for method in methods:
-        device = (f"measured on {method.device}",) if method.device else ()
-        for note in (*device, *method.notes):
-            by_note.setdefault(note, []).append(method.name)
-    items = []
-    for note, names in by_note.items():
-        who = "" if len(names) == len(methods) else f"{', '.join(names)}: "
-        items.append(f"<li>{escape(who + note)}</li>")
-    return f'<ul class="notes">{"".join(items)}</ul>' if items else ""
 
 
 def _examples(examples: Sequence[ReportExample]) -> str:
