@@ -58,7 +58,9 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
         UserError: The folder holds no run, or no checkpoint yet.
     """
     if not (folder / CONFIG_FILE).is_file():
-        raise UserError(f"{folder} is not a run folder (no {CONFIG_FILE}); make one with `wildgs train SCENE`")
+        raise UserError(
+            f"{folder} is not a run folder (no {CONFIG_FILE}); make one with `wildgs train SCENE`"
+        )
     config = read_config(folder / CONFIG_FILE)
     checkpoint = newest_checkpoint(folder)
     if checkpoint is None:
@@ -117,5 +119,3 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Align
     """Writes a checkpoint from which training can go on and every other verb can read."""
     header: dict[str, Any] = {"config": to_plain(config), "alignment": alignment.to_dict()}
     return save_checkpoint(folder / CHECKPOINT_FOLDER, trainer.step, trainer.state(), header)
-
-

@@ -38,12 +38,9 @@ def run(command: Command) -> None:
     loaded = load_run(command.run)
     with counting("reading photos") as progress:
         scene = loaded.load_scene(progress)
-    protocols: tuple[Protocol, ...] = (
-        ("full", "half") if command.protocol == "both" else (command.protocol,)
-    )
+    protocols: tuple[Protocol, ...] = ("full", "half") if command.protocol == "both" else (command.protocol,)
     scores = {
-        protocol: evaluate_run(loaded, scene, protocol, lpips_folder=command.lpips)
-        for protocol in protocols
+        protocol: evaluate_run(loaded, scene, protocol, lpips_folder=command.lpips) for protocol in protocols
     }
     print_scores({str(command.run): scores})
 

@@ -23,17 +23,19 @@ from wildgs.engine.trainer import StepReport
 LINE_SECONDS = 10.0
 REFRESH_STEPS = 10
 
-console = Console(highlight=False)
+console = Console(highlight=False, soft_wrap=True)
 
 
 class TrainingProgress:
     """An observer of training that shows steps per second, loss, Gaussians and time left."""
 
     def __init__(self, label: str, steps: int, done: int = 0) -> None:
-        """Args:
-        label: Stands before the bar.
-        steps: Of the whole run.
-        done: Steps done before (a resumed run).
+        """Sets up a `TrainingProgress`.
+
+        Args:
+            label: Stands before the bar.
+            steps: Of the whole run.
+            done: Steps done before (a resumed run).
         """
         self.label, self.steps, self.done = label, steps, done
         self._started = time.monotonic()

@@ -43,9 +43,7 @@ class Command:
 
 def run(command: Command) -> None:
     """Trains, with progress on the console."""
-    config = RunConfig(
-        command.scene.resolve(), command.method, command.data, command.model, command.train
-    )
+    config = RunConfig(command.scene.resolve(), command.method, command.data, command.model, command.train)
     if command.resume:
         config = replace(read_config(command.output / CONFIG_FILE), scene=config.scene)
     scene = read_scene(config)

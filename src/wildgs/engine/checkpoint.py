@@ -38,9 +38,7 @@ class Checkpoint:
         return {k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)}
 
 
-def save_checkpoint(
-    folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]
-) -> Path:
+def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> Path:
     """Writes ``step_NNNNNNNN.safetensors`` into a folder; the last two are kept.
 
     A reader never sees half a file: it is written under another name, flushed to disk, and renamed.

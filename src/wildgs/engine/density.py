@@ -52,10 +52,12 @@ class DensityControl:
     """Gathers screen statistics and edits the Gaussians."""
 
     def __init__(self, config: DensityConfig, extent: float, num_gaussians: int) -> None:
-        """Args:
-        config: Thresholds.
-        extent: Radius of the cameras' region, world units.
-        num_gaussians: N now.
+        """Sets up a `DensityControl`.
+
+        Args:
+            config: Thresholds.
+            extent: Radius of the cameras' region, world units.
+            num_gaussians: N now.
         """
         self.config = config
         self.extent = extent

@@ -124,9 +124,7 @@ class Optimizers:
             prefix = f"{kind}.{index}."
             found = {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
             if found:
-                optimizer.state[parameter] = {
-                    key: value.to(parameter.device) for key, value in found.items()
-                }
+                optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in found.items()}
 
     def _parameters(self) -> Iterator[tuple[str, int, Tensor, torch.optim.Adam]]:
         for kind, optimizer in (("rows", self.rows), ("networks", self.networks)):

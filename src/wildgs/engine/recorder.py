@@ -17,10 +17,12 @@ class Recorder:
     """An observer of training; a context manager that closes its files."""
 
     def __init__(self, folder: Path, *, scalars_every: int = 50, pictures_every: int = 500) -> None:
-        """Args:
-        folder: The run folder.
-        scalars_every: Steps between log entries.
-        pictures_every: Steps between pictures on tensorboard.
+        """Sets up a `Recorder`.
+
+        Args:
+            folder: The run folder.
+            scalars_every: Steps between log entries.
+            pictures_every: Steps between pictures on tensorboard.
         """
         self.scalars_every = scalars_every
         self.pictures_every = pictures_every
@@ -75,5 +77,7 @@ class Recorder:
 def _grey(depth: Tensor) -> Tensor:
     """Inverse depth, stretched to [0, 1]: near is bright, empty is black."""
     disparity = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
-    limit = disparity[disparity > 0].quantile(0.98) if bool((disparity > 0).any()) else disparity.new_tensor(1)
+    limit = (
+        disparity[disparity > 0].quantile(0.98) if bool((disparity > 0).any()) else disparity.new_tensor(1)
+    )
     return (disparity / limit).clamp(0, 1)[..., None]

@@ -41,9 +41,11 @@ class Schedule:
     """The schedules of one run."""
 
     def __init__(self, config: ScheduleConfig, steps: int) -> None:
-        """Args:
-        config: In the paper's steps.
-        steps: The run's own length.
+        """Sets up a `Schedule`.
+
+        Args:
+            config: In the paper's steps.
+            steps: The run's own length.
         """
         self.steps = steps
         self._factor = steps / REFERENCE_STEPS

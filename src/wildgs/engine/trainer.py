@@ -75,10 +75,12 @@ class Trainer:
     """Trains a method on a scene's training photos."""
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig) -> None:
-        """Args:
-        method: Trained in place, on the device on which its parameters are.
-        scene: The photos; nothing of it under `truth/` is read.
-        config: How.
+        """Sets up a `Trainer`.
+
+        Args:
+            method: Trained in place, on the device on which its parameters are.
+            scene: The photos; nothing of it under `truth/` is read.
+            config: How.
 
         Raises:
             UserError: There is no photo to train on.
@@ -124,9 +126,7 @@ class Trainer:
         self.step += 1
         density = self._control_density()
         self.seconds += time.perf_counter() - start
-        return StepReport(
-            self.step, view, losses, output, len(self.method.gaussians), density, self.seconds
-        )
+        return StepReport(self.step, view, losses, output, len(self.method.gaussians), density, self.seconds)
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255

@@ -7,8 +7,8 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from wildgs.rasterize import Projection, project
 from wildgs.geometry.camera import Camera
+from wildgs.rasterize import Projection, project
 
 INITIAL_OPACITY = 0.1
 
@@ -24,8 +24,10 @@ class Gaussians(nn.Module):
     """
 
     def __init__(self, rows: dict[str, Tensor]) -> None:
-        """Args:
-        rows: Initial values; must hold means, quats, log_scales and opacity_logits.
+        """Sets up a `Gaussians`.
+
+        Args:
+            rows: Initial values; must hold means, quats, log_scales and opacity_logits.
         """
         super().__init__()
         self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})

@@ -82,9 +82,7 @@ class Method(nn.Module, ABC):
         """
 
     @abstractmethod
-    def shade(
-        self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None
-    ) -> Float[Tensor, "N K 3"]:
+    def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics of the Gaussians under an appearance.
 
         Args:

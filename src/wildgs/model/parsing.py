@@ -41,9 +41,11 @@ class Parsing(MixedModule):
     """UNet with a ResNet-18 encoder: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder)."""
 
     def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
-        """Args:
-        config: Sizes and sources.
-        encoder: Overrides the encoder that `config` names.
+        """Sets up a `Parsing`.
+
+        Args:
+            config: Sizes and sources.
+            encoder: Overrides the encoder that `config` names.
         """
         super().__init__()
         self.config = config
@@ -58,9 +60,7 @@ class Parsing(MixedModule):
         nn.init.zeros_(self.mask_head.weight)
         nn.init.constant_(self.mask_head.bias, STATIC_BIAS)
 
-    def forward(
-        self, photo: Float[Tensor, "H W 3"]
-    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
+    def forward(self, photo: Float[Tensor, "H W 3"]) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
         """Parses one photo.
 
         Args:

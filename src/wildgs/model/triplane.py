@@ -96,9 +96,7 @@ def project_cloud(
     return pictures.reshape(3, 2, PICTURE_CHANNELS, resolution, resolution)
 
 
-def _nearest_per_cell(
-    cell: Tensor, distance: Float[Tensor, " P"], num_cells: int
-) -> tuple[Tensor, Tensor]:
+def _nearest_per_cell(cell: Tensor, distance: Float[Tensor, " P"], num_cells: int) -> tuple[Tensor, Tensor]:
     """Cells that are hit, and the index of the nearest point in each; ties go to the first point."""
     # One integer that orders by distance first and by index second makes scatter-min yield the winner itself.
     ordinal = ((distance + 1) * (2**30 - 1)).long().clamp_(0, 2**31 - 2)
@@ -109,9 +107,7 @@ def _nearest_per_cell(
     return hit, best[hit] & 0xFFFFFFFF
 
 
-def sample_planes(
-    planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N C"]:
+def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
     """f_xy + f_yz + f_zx: bilinear samples of the three planes at points, summed.
 
     Differentiable in the planes; the points take no gradient on the CPU.

@@ -35,9 +35,7 @@ class VanillaGS(Method):
         """Nothing: this method knows one light only."""
         return Appearance()
 
-    def shade(
-        self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None
-    ) -> Float[Tensor, "N K 3"]:
+    def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """The stored harmonics."""
         stored = self.gaussians.rows
         sh = torch.cat([stored["sh0"], stored["shN"]], dim=1)

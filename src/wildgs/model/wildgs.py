@@ -51,11 +51,13 @@ class WildGS(Method):
     def __init__(
         self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
     ) -> None:
-        """Args:
-        config: The model's configuration.
-        gaussians: With a row `intrinsic` beside the geometry.
-        box: What the triplane covers.
-        encoder: Overrides the encoder that `config` names.
+        """Sets up a `WildGS`.
+
+        Args:
+            config: The model's configuration.
+            gaussians: With a row `intrinsic` beside the geometry.
+            box: What the triplane covers.
+            encoder: Overrides the encoder that `config` names.
         """
         super().__init__()
         self.config = config
@@ -142,7 +144,7 @@ class WildGS(Method):
         return Embeddings(appearance.global_embedding, local)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
+        """Fuses to spherical harmonics: sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
         intrinsic = self.gaussians.rows["intrinsic"]
         if rows is not None:
             intrinsic = intrinsic[rows]
@@ -150,9 +152,7 @@ class WildGS(Method):
             intrinsic = torch.zeros_like(intrinsic)
         return self.fusion(embeddings.global_embedding, embeddings.local_embeddings, intrinsic)
 
-    def shade(
-        self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None
-    ) -> Float[Tensor, "N K 3"]:
+    def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics under an appearance: sample, embed, fuse."""
         return self.fuse(self.embed(appearance, rows), rows)
 

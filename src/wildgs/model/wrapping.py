@@ -41,10 +41,12 @@ class Wrapping(MixedModule):
     high: Tensor
 
     def __init__(self, config: WrappingConfig, box: Box, *, reverse: bool = True) -> None:
-        """Args:
-        config: Sizes.
-        box: What the triplane covers.
-        reverse: Whether the reverse projections c' are used (off: the ablation 'w/o {c'}').
+        """Sets up a `Wrapping`.
+
+        Args:
+            config: Sizes.
+            box: What the triplane covers.
+            reverse: Whether the reverse projections c' are used (off: the ablation 'w/o {c'}').
         """
         super().__init__()
         self.config = config
@@ -63,9 +65,7 @@ class Wrapping(MixedModule):
         """The AABB that the triplane covers."""
         return Box(self.low, self.high)
 
-    def planes(
-        self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]
-    ) -> Float[Tensor, "3 C R R"]:
+    def planes(self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]) -> Float[Tensor, "3 C R R"]:
         """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates."""
         pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution)
         if not self.reverse:
