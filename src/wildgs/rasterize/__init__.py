@@ -1,6 +1,13 @@
 """A differentiable Gaussian rasteriser: one interface; CPU (Numba), CUDA (gsplat) and a dense torch reference."""
 
-from wildgs.rasterize.dispatch import blend, pick_backend, project, rasterize, render_uint8, sh_to_colors
+from wildgs.rasterize.dispatch import (
+    blend,
+    pick_backend,
+    project,
+    rasterize,
+    render_uint8,
+    sh_to_colors,
+)
 from wildgs.rasterize.interface import BackendName, Projection, Rendering
 
 __all__ = [

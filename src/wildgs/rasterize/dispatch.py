@@ -31,7 +31,11 @@ def _module(name: BackendName):
 
 
 def _check(
-    name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor, backend: BackendName
+    name: str,
+    tensor: Tensor,
+    shape: tuple[int | None, ...],
+    like: Tensor,
+    backend: BackendName,
 ) -> None:
     """Shape (None: any size), device and number type of an input."""
     fits = tensor.dim() == len(shape) and all(

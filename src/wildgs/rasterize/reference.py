@@ -44,7 +44,11 @@ def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int,
     ty = (y / z).clamp(float(-cy / fy - margin_y), float((height - cy) / fy + margin_y))
     zero = torch.zeros_like(z)
     return torch.stack(
-        [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], dim=-2
+        [
+            torch.stack([fx / z, zero, -fx * tx / z], -1),
+            torch.stack([zero, fy / z, -fy * ty / z], -1),
+        ],
+        dim=-2,
     )
 
 

@@ -11,12 +11,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
-from wildgs.rasterize.cpu import backward_kernels, forward_kernels, geometry_kernels, sh_kernels, tile_kernels
+from wildgs.rasterize.cpu import (
+    backward_kernels,
+    forward_kernels,
+    geometry_kernels,
+    sh_kernels,
+    tile_kernels,
+)
+from wildgs.rasterize.cpu.reach_kernels import RECORD, TILE
 from wildgs.rasterize.cpu.scratch import scratch
 from wildgs.rasterize.cpu.threads import announce_compilation, launch, thread_count
 from wildgs.rasterize.interface import Projection, Rendering
 
-TILE = tile_kernels.TILE
 GROUP = geometry_kernels.GROUP
 _SUM_CHUNK = 1024
 
@@ -25,18 +31,22 @@ _SUM_CHUNK = 1024
 class TileLists:
     """What blending needs to know of the geometry; arrays are flat.
 
+    Gaussians that reach the picture are numbered by rank, so that neighbours in the picture are neighbours in memory.
+
     Attributes:
-        records: Per Gaussian what a tile's inner loop reads, eight floats (see `geometry_kernels.RECORD`).
-        tile_counts: Number of tiles that each Gaussian reaches.
-        starts: First slot of each Gaussian's (tile, Gaussian) pairs.
+        ranks: Each Gaussian's rank; -1 where it reaches no tile.
+        homes: Each rank's Gaussian.
+        records: Per rank what blending reads, eight floats (see `reach_kernels.RECORD`).
+        starts: First slot of each rank's (tile, Gaussian) pairs, and the number of pairs.
         offsets: Where each tile's list starts in `ids`; one more than there are tiles.
-        ids: Gaussians, tile by tile, nearest first.
-        slots: Of each entry of `ids`: its slot among the Gaussian's pairs.
-        tile_order: Tiles, longest list first, so that threads end together.
+        ids: Ranks, tile by tile, nearest first.
+        slots: Of each entry of `ids`: its slot among the rank's pairs.
+        tile_order: Tiles with long lists first, so that threads end together.
     """
 
+    ranks: np.ndarray
+    homes: np.ndarray
     records: np.ndarray
-    tile_counts: np.ndarray
     starts: np.ndarray
     offsets: np.ndarray
     ids: np.ndarray
@@ -74,11 +84,23 @@ def _padded(tensor: Tensor) -> Tensor:
     return tensor if missing <= 0 else torch.cat([tensor, tensor.new_zeros(missing, *tensor.shape[1:])])
 
 
+def _first(tensor: Tensor, n: int) -> Tensor:
+    """Undoes `_padded`; the tensor itself where nothing was added, as slicing costs a copy in the backward pass."""
+    return tensor if len(tensor) == n else tensor[:n]
+
+
 class _Project(torch.autograd.Function):
     """Hands out what the projection kernel wrote; its backward pass is `project_backward`."""
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, lens: _Lens, outputs: Any) -> Any:
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        lens: _Lens,
+        outputs: Any,
+    ) -> Any:
         means2d, depths, conics, radii = outputs
         ctx.save_for_backward(means, quats, scales, conics, radii)
         ctx.lens = lens
@@ -88,7 +110,11 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *grads: Any) -> Any:
         v_means2d, v_depths, v_conics = grads
         means, quats, scales, conics, radii = ctx.saved_tensors
-        outputs = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
+        outputs = (
+            torch.empty_like(means),
+            torch.empty_like(quats),
+            torch.empty_like(scales),
+        )
         launch(
             geometry_kernels.project_backward,
             *map(_flat, (means, quats, scales)),
@@ -120,55 +146,92 @@ def project(
     count = len(means_)
     means2d, depths = torch.empty(count, 2), torch.empty(count)
     conics, radii = torch.empty(count, 3), torch.empty(count, dtype=torch.int32)
-    records = np.empty(count * geometry_kernels.RECORD, np.float32)
-    tile_counts, boxes = np.empty(count, np.int32), np.empty(4 * count, np.int16)
-    launch(
-        geometry_kernels.project_forward,
-        *map(_flat, (means_, quats_, scales_, opacities_)),
-        *lens.arguments(),
-        np.float32(near),
-        *map(_flat, (means2d, depths, conics, radii)),
-        records,
-        boxes,
-        tile_counts,
-        items=_chunks(count),
-    )
-    tiles = _bin(depths.numpy(), records, boxes, tile_counts, camera)
+    tile_counts = np.empty(count, np.int32)
+    with (
+        scratch("records", count * RECORD, np.float32) as records,
+        scratch("boxes", 4 * count, np.int16) as boxes,
+        scratch("masks", count, np.int32) as masks,
+    ):
+        launch(
+            geometry_kernels.project_forward,
+            *map(_flat, (means_, quats_, scales_, opacities_)),
+            *lens.arguments(),
+            np.float32(near),
+            *map(_flat, (means2d, depths, conics, radii)),
+            records, boxes, masks, tile_counts,
+            items=_chunks(count),
+        )  # fmt: skip
+        tiles = _list_tiles(depths.numpy(), records, boxes, masks, tile_counts, camera)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means_, quats_, scales_)):
         outputs = (means2d, depths, conics, radii)
         means2d, depths, conics = _Project.apply(means_, quats_, scales_, lens, outputs)  # type: ignore[misc]
     return Projection(
         camera=camera,
-        means2d=means2d[:n],
-        depths=depths[:n],
-        conics=conics[:n],
+        means2d=_first(means2d, n),
+        depths=_first(depths, n),
+        conics=_first(conics, n),
         opacities=opacities,
-        radii=radii[:n],
+        radii=_first(radii, n),
         backend="cpu",
         tiles=tiles,
         absgrad=torch.zeros(n, 2) if absgrad else None,
     )
 
 
-def _bin(
-    depths: np.ndarray, records: np.ndarray, boxes: np.ndarray, tile_counts: np.ndarray, camera: Camera
+def _list_tiles(
+    depths: np.ndarray,
+    records: np.ndarray,
+    boxes: np.ndarray,
+    masks: np.ndarray,
+    tile_counts: np.ndarray,
+    camera: Camera,
 ) -> TileLists:
-    """Lists each tile's Gaussians, nearest first."""
+    """Ranks the Gaussians and lists each tile's, nearest first (see `tile_kernels`)."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    starts = np.empty(tile_counts.size, np.int64)
-    order, pairs = _serial(tile_kernels.sort_by_depth, depths, tile_counts, starts)
+    n = tile_counts.size
+    seen = int(np.count_nonzero(tile_counts))
+    ranks, homes = np.empty(n, np.int32), np.empty(seen, np.int32)
+    ranked_records, starts = (
+        np.empty(seen * RECORD, np.float32),
+        np.empty(seen + 1, np.int64),
+    )
     offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
-    ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
-    chunks = max(1, min(4 * thread_count(), order.size // 256))
-    with scratch("cursors", chunks * tiles_x * tiles_y, np.int64) as flat:
+    chunks = max(1, min(2 * thread_count(), n // 1024))
+    with (
+        scratch("cursors", chunks * tiles_x * tiles_y, np.int64) as flat,
+        scratch("spans", 4 * seen, np.int32) as spans,
+        scratch("keys", 2 * seen, np.uint32) as keys,
+        scratch("order", 2 * seen, np.int32) as order,
+    ):
         cursors = flat.reshape(chunks, -1)
-        launch(tile_kernels.count_pairs, order, records, boxes, tiles_x, cursors, items=chunks)
+        launch(tile_kernels.count_homes, tile_counts, boxes, tiles_x, cursors, items=chunks)
         _serial(tile_kernels.place_chunks, cursors, offsets)
         launch(
-            tile_kernels.write_pairs, order, records, boxes, starts, tiles_x, cursors, ids, slots, items=chunks
+            tile_kernels.move_home,
+            tile_counts, boxes, masks, records, tiles_x, cursors, ranks, homes, ranked_records, spans,
+            items=chunks,
         )  # fmt: skip
-    tile_order = np.argsort(-np.diff(offsets), kind="stable")
-    return TileLists(records, tile_counts, starts, offsets, ids, slots, tile_order)
+        pairs = _serial(tile_kernels.number_slots, spans, starts)
+        order = _serial(
+            tile_kernels.sort_by_depth, depths, ranks, keys[:seen], order[:seen], keys[seen:], order[seen:]
+        )  # fmt: skip
+        launch(
+            tile_kernels.count_pairs,
+            order,
+            spans,
+            ranked_records,
+            tiles_x,
+            cursors,
+            items=chunks,
+        )
+        _serial(tile_kernels.place_chunks, cursors, offsets)
+        ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
+        launch(
+            tile_kernels.write_pairs, order, spans, ranked_records, starts, tiles_x, cursors, ids, slots, items=chunks
+        )  # fmt: skip
+    # In powers of two of the length: within one, neighbouring tiles follow each other and share what is in the cache.
+    tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
+    return TileLists(ranks, homes, ranked_records, starts, offsets, ids, slots, tile_order)
 
 
 def _serial(kernel: Any, *arguments: Any) -> Any:
@@ -194,7 +257,11 @@ class _Blend(torch.autograd.Function):
         pictures = _blend_pictures(projection, colors, background, with_depth, bookkeeping=True)
         out_colors, out_depth, out_alpha, transmittance, last = pictures
         ctx.save_for_backward(conics, depths, opacities, colors, background, out_depth, out_alpha)
-        ctx.tiles, ctx.camera, ctx.absgrad = tiles, projection.camera, projection.absgrad
+        ctx.tiles, ctx.camera, ctx.absgrad = (
+            tiles,
+            projection.camera,
+            projection.absgrad,
+        )
         ctx.transmittance, ctx.last, ctx.with_depth = transmittance, last, with_depth
         return out_colors, out_depth, out_alpha
 
@@ -207,35 +274,64 @@ class _Blend(torch.autograd.Function):
         # Rows are padded to whole vectors.
         stride = -(-(backward_kernels.ROW_COLORS + channels) // 16) * 16
         v_means2d, v_conics = torch.empty(n, 2), torch.empty(n, 3)
-        v_opacities, v_depths, v_values = torch.empty(n), torch.empty(n), torch.empty(n, channels)
+        v_opacities, v_depths, v_values = (
+            torch.empty(n),
+            torch.empty(n),
+            torch.empty(n, channels),
+        )
         absgrad = None if ctx.absgrad is None else _flat(ctx.absgrad)
         with scratch("rows", tiles.ids.size * stride, np.float32) as rows:
             launch(
                 backward_kernels.blend_backward,
                 tiles.tile_order, tiles.offsets, tiles.ids, tiles.slots, tiles.records,
-                _flat(depths), _flat(colors), channels, ctx.with_depth, _flat(background),
+                _rank_values(tiles, depths, colors), channels, ctx.with_depth, _flat(background),
                 ctx.camera.width, ctx.camera.height, ctx.transmittance, ctx.last, _flat(out_depth),
                 _flat(v_colors), _flat(v_depth), _flat(v_alpha), stride, rows, absgrad is not None,
             )  # fmt: skip
             launch(
                 backward_kernels.sum_rows,
-                _SUM_CHUNK, tiles.tile_counts, tiles.starts, stride, rows, channels, _flat(conics), _flat(opacities),
+                _SUM_CHUNK, tiles.ranks, tiles.starts, stride, rows, channels, _flat(conics), _flat(opacities),
                 *map(_flat, (v_means2d, v_conics, v_opacities, v_depths, v_values)), absgrad,
                 items=-(-n // _SUM_CHUNK),
             )  # fmt: skip
         v_background = None
         if ctx.needs_input_grad[5]:
             v_background = ((1 - out_alpha)[..., None] * v_colors).sum((0, 1))
-        return v_means2d, v_conics, v_depths, v_opacities, v_values, v_background, None, None
+        return (
+            v_means2d,
+            v_conics,
+            v_depths,
+            v_opacities,
+            v_values,
+            v_background,
+            None,
+            None,
+        )
+
+
+def _rank_values(tiles: TileLists, depths: Tensor, colors: Tensor) -> np.ndarray:
+    """Depths and colours in the order of ranks."""
+    values = np.empty(tiles.homes.size * (colors.shape[1] + 1), np.float32)
+    launch(
+        tile_kernels.rank_values,
+        _SUM_CHUNK, tiles.homes, _flat(depths), _flat(colors), colors.shape[1], values,
+        items=-(-tiles.homes.size // _SUM_CHUNK),
+    )  # fmt: skip
+    return values
 
 
 def _blend_pictures(
-    projection: Projection, colors: Tensor, background: Tensor, with_depth: bool, bookkeeping: bool
+    projection: Projection,
+    colors: Tensor,
+    background: Tensor,
+    with_depth: bool,
+    bookkeeping: bool,
 ) -> Any:
     """Runs the forward kernel; gives colours, depth, alpha, final transmittance and last positions."""
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
     channels = colors.shape[1]
+    values = _rank_values(tiles, projection.depths, colors)
     out_colors = torch.empty(height, width, channels)
     out_depth = torch.empty(height, width) if with_depth else torch.zeros(())
     out_alpha = torch.empty(height, width)
@@ -245,7 +341,7 @@ def _blend_pictures(
     launch(
         forward_kernels.blend_forward,
         tiles.tile_order, tiles.offsets, tiles.ids, tiles.records,
-        _flat(projection.depths), _flat(colors), channels, with_depth, _flat(background),
+        values, channels, with_depth, _flat(background),
         width, height, _flat(out_colors), _flat(out_depth), _flat(out_alpha), transmittance, last,
     )  # fmt: skip
     if not with_depth:
@@ -254,12 +350,20 @@ def _blend_pictures(
 
 
 def blend(
-    projection: Projection, colors: Float[Tensor, "N C"], background: Float[Tensor, "C"] | None, depth: bool
+    projection: Projection,
+    colors: Float[Tensor, "N C"],
+    background: Float[Tensor, "C"] | None,
+    depth: bool,
 ) -> Rendering:
     """See `wildgs.rasterize.blend`."""
     if background is None:
         background = colors.new_zeros(colors.shape[1])
-    geometry = (projection.means2d, projection.conics, projection.depths, projection.opacities)
+    geometry = (
+        projection.means2d,
+        projection.conics,
+        projection.depths,
+        projection.opacities,
+    )
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*geometry, colors, background)):
         pictures = _Blend.apply(*geometry, colors, background, projection, depth)
     else:
@@ -272,7 +376,12 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, sh: Tensor, eye: np.ndarray, degree: int, visible: np.ndarray
+        ctx: Any,
+        means: Tensor,
+        sh: Tensor,
+        eye: np.ndarray,
+        degree: int,
+        visible: np.ndarray,
     ) -> Any:
         out = torch.empty(len(means), 3)
         launch(

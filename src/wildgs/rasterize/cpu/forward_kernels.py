@@ -3,8 +3,8 @@
 A tile of 16 x 16 pixels is sixteen blocks of 4 x 4; a block is one vector. For each Gaussian of the tile's list
 only the blocks that it reaches and that still let light through are visited.
 
-A block's transmittance doubles as its pixels' state: negative where the pixel is saturated (its value is the
-magnitude) or outside the picture.
+A block's numbers lie together in memory: transmittance, depth sum, then the channels' sums. Transmittance doubles as
+the pixels' state: negative where the pixel is saturated (its value is the magnitude) or outside the picture.
 """
 
 from __future__ import annotations
@@ -12,6 +12,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from wildgs.rasterize.cpu.reach_kernels import (
+    HALF,
+    MIN_LEVEL,
+    REACH,
+    RECORD,
+    TILE,
+    nearest_exponent,
+)
 from wildgs.rasterize.cpu.simd import (
     fetch_add,
     fma,
@@ -19,6 +27,7 @@ from wildgs.rasterize.cpu.simd import (
     lane_y,
     lowest_bit,
     mask_bits,
+    prefetch,
     select,
     splat,
     vexp2,
@@ -27,35 +36,103 @@ from wildgs.rasterize.cpu.simd import (
     vmin,
     vstore,
 )
-from wildgs.rasterize.cpu.tile_kernels import reach
 
-TILE = 16
 PIXELS = TILE * TILE
-RECORD = 8
-MIN_LEVEL = np.float32(-7.99435344)  # log2(1/255)
+LANES = 16
+# A tile's list is worked off in batches: all of a batch's Gaussians for one block,
+# whose sums stay in registers.
+BATCH = 64
+AHEAD = 16  # list entries between asking for a Gaussian's numbers and using them
+X, Y, QA, QB, QC, LEVEL, Y_PER_X, X_PER_Y, DEPTH, RED, GREEN, BLUE = tuple(range(0, 12 * BATCH, BATCH))
+FIELDS = 12
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
-HALF = np.float32(0.5)
 
 
 @njit(nogil=True, cache=True)
-def open_tile(tx, ty, width, height, state):
-    """Transmittance 1 inside the picture and -1 outside; returns the bits of blocks that have pixels inside."""
+def aligned(size):
+    """A float32 array that starts at a cache line, so that no vector straddles two."""
+    raw = np.empty(size + 16, np.float32)
+    skip = (64 - raw.ctypes.data % 64) % 64 // 4
+    return raw[skip : skip + size]
+
+
+@njit(nogil=True, cache=True)
+def open_tile(tx, ty, width, height, stride, sums):
+    """Sums 0 and transmittance 1 inside the picture, -1 outside; returns the bits of blocks with pixels inside."""
     alive = 0
+    sums[:] = 0.0
     for block in range(16):
         for lane in range(16):
             x = tx * TILE + (block & 3) * 4 + (lane & 3)
             y = ty * TILE + (block >> 2) * 4 + (lane >> 2)
             inside = x < width and y < height
-            state[block * 16 + lane] = 1.0 if inside else -1.0
+            sums[block * stride + lane] = 1.0 if inside else -1.0
             if inside:
                 alive |= 1 << block
     return alive
 
 
 @njit(nogil=True, cache=True)
+def load_batch(begin, count, ids, records, values, channels, tx, ty, batch):
+    """Copies the numbers of `count` Gaussians of a tile's list into rows of BATCH floats (see X to BLUE).
+
+    They lie scattered in memory: they are asked for ahead of time.
+    """
+    origin_x, origin_y = np.float32(tx * TILE) + HALF, np.float32(ty * TILE) + HALF
+    row = channels + 1
+    for i in range(count):
+        soon = ids[min(begin + i + AHEAD, ids.size - 1)]
+        prefetch(records, soon * RECORD)
+        prefetch(values, soon * row)
+        r, v = ids[begin + i] * RECORD, ids[begin + i] * row
+        batch[X + i] = origin_x - records[r]
+        batch[Y + i] = origin_y - records[r + 1]
+        batch[QA + i], batch[QB + i], batch[QC + i] = (
+            records[r + 2],
+            records[r + 3],
+            records[r + 4],
+        )
+        batch[LEVEL + i] = records[r + 5]
+        batch[Y_PER_X + i], batch[X_PER_Y + i] = records[r + 6], records[r + 7]
+        batch[DEPTH + i] = values[v]
+        if channels == 3:
+            batch[RED + i], batch[GREEN + i], batch[BLUE + i] = (
+                values[v + 1],
+                values[v + 2],
+                values[v + 3],
+            )
+
+
+@njit(nogil=True, cache=True)
+def reach_by_block(count, batch, words):
+    """For each block of the tile a word with a bit for every Gaussian of the batch that reaches it."""
+    words[:] = 0
+    four, three = np.float32(4.0), np.float32(3.0)
+    for group in range(0, count, LANES):
+        valid = (1 << min(count - group, LANES)) - 1
+        x, y, level = (
+            vload(batch, X + group),
+            vload(batch, Y + group),
+            vload(batch, LEVEL + group),
+        )
+        A, B, C = (
+            vload(batch, QA + group),
+            vload(batch, QB + group),
+            vload(batch, QC + group),
+        )
+        y_per_x, x_per_y = vload(batch, Y_PER_X + group), vload(batch, X_PER_Y + group)
+        for row in range(4):
+            y0 = y + four * np.float32(row)
+            for column in range(4):
+                x0 = x + four * np.float32(column)
+                best = nearest_exponent(x0, y0, x0 + three, y0 + three, A, B, C, y_per_x, x_per_y)
+                words[row * 4 + column] |= (mask_bits(best + level >= REACH) & valid) << group
+
+
+@njit(nogil=True, cache=True)
 def blend_forward(
-    counter, tile_order, offsets, ids, records, depths, colors, channels, with_depth, background,
+    counter, tile_order, offsets, ids, records, values, channels, with_depth, background,
     width, height, out_colors, out_depth, out_alpha, final_transmittance, last,
 ):  # fmt: skip
     """Blends all tiles.
@@ -64,96 +141,109 @@ def blend_forward(
     and block for the backward pass; they are None where there will be none.
     """
     tiles_x = (width + TILE - 1) // TILE
-    state = np.empty(PIXELS, np.float32)
-    reached = np.empty(PIXELS, np.float32)
-    sums = np.empty((channels + 1) * PIXELS, np.float32)
+    stride = (channels + 2) * LANES
+    sums = aligned(16 * stride)
+    reached = aligned(PIXELS)
+    batch = aligned(FIELDS * BATCH)
+    words = np.empty(16, np.int64)
     while True:
         item = fetch_add(counter, 1)
         if item >= tile_order.size:
             break
         tile = tile_order[item]
         tx, ty = tile % tiles_x, tile // tiles_x
-        alive = open_tile(tx, ty, width, height, state)
-        sums[:] = 0.0
+        alive = open_tile(tx, ty, width, height, stride, sums)
         reached[:] = 0.0
-        begin = offsets[tile]
-        for p in range(begin, offsets[tile + 1]):
+        begin, end = offsets[tile], offsets[tile + 1]
+        for start in range(begin, end, BATCH):
             if alive == 0:
                 break
-            g = ids[p]
-            r = g * RECORD
-            x = np.float32(tx * TILE) + HALF - records[r]
-            y = np.float32(ty * TILE) + HALF - records[r + 1]
-            A, B, C, level = records[r + 2], records[r + 3], records[r + 4], records[r + 5]
-            blocks = alive & reach(x, y, np.float32(4.0), A, B, C, level, records[r + 6], records[r + 7])
-            while blocks != 0:
-                block = lowest_bit(blocks)
-                blocks &= blocks - 1
-                at = block * 16
-                dx = lane_x() + (x + np.float32((block & 3) * 4))
-                dy = lane_y() + (y + np.float32((block >> 2) * 4))
-                exponent = fma(dx, fma(dx, A, dy * B), fma(dy * C, dy, level))
-                before = vload(state, at)
-                hit = (exponent >= MIN_LEVEL) & (before > 0.0)
-                alpha = vmin(vexp2(vmin(vmax(exponent, MIN_LEVEL), 0.0)), MAX_ALPHA)
-                after = before - before * alpha
-                kept = hit & (after > MIN_TRANSMITTANCE)
-                weight = select(kept, before * alpha, 0.0)
-                after = select(hit, select(kept, after, -before), before)
-                vstore(state, at, after)
-                if last is not None:
-                    vstore(reached, at, select(kept, np.float32(p - begin + 1), vload(reached, at)))
+            count = min(BATCH, end - start)
+            load_batch(start, count, ids, records, values, channels, tx, ty, batch)
+            reach_by_block(count, batch, words)
+            for block in range(16):
+                word = words[block]
+                if (alive >> block) & 1 == 0 or word == 0:
+                    continue
+                at = block * stride
+                px = lane_x() + np.float32((block & 3) * 4)
+                py = lane_y() + np.float32((block >> 2) * 4)
+                before, depth, hits = (
+                    vload(sums, at),
+                    vload(sums, at + LANES),
+                    vload(reached, block * LANES),
+                )
+                red, green, blue = splat(0.0), splat(0.0), splat(0.0)
                 if channels == 3:
-                    c = 3 * g
-                    vstore(sums, at, fma(weight, colors[c], vload(sums, at)))
-                    vstore(sums, at + PIXELS, fma(weight, colors[c + 1], vload(sums, at + PIXELS)))
-                    vstore(sums, at + 2 * PIXELS, fma(weight, colors[c + 2], vload(sums, at + 2 * PIXELS)))
-                else:
-                    for k in range(channels):
-                        vstore(
-                            sums,
-                            at + k * PIXELS,
-                            fma(weight, colors[channels * g + k], vload(sums, at + k * PIXELS)),
-                        )
-                if with_depth:
-                    d = at + channels * PIXELS
-                    vstore(sums, d, fma(weight, depths[g], vload(sums, d)))
-                if mask_bits(after > 0.0) == 0:
+                    red, green = (
+                        vload(sums, at + 2 * LANES),
+                        vload(sums, at + 3 * LANES),
+                    )
+                    blue = vload(sums, at + 4 * LANES)
+                while word != 0:
+                    i = lowest_bit(word)
+                    word &= word - 1
+                    dx, dy = px + batch[X + i], py + batch[Y + i]
+                    exponent = fma(
+                        dx, fma(dx, batch[QA + i], dy * batch[QB + i]), fma(dy * batch[QC + i], dy, batch[LEVEL + i])
+                    )  # fmt: skip
+                    hit = (exponent >= MIN_LEVEL) & (before > 0.0)
+                    alpha = vmin(vexp2(exponent), MAX_ALPHA)
+                    weight = before * alpha
+                    after = before - weight
+                    kept = hit & (after > MIN_TRANSMITTANCE)
+                    weight = select(kept, weight, 0.0)
+                    before = select(kept, after, select(hit, -before, before))
+                    if last is not None:
+                        hits = select(kept, splat(np.float32(start - begin + i + 1)), hits)
+                    if with_depth:
+                        depth = fma(weight, batch[DEPTH + i], depth)
+                    if channels == 3:
+                        red = fma(weight, batch[RED + i], red)
+                        green = fma(weight, batch[GREEN + i], green)
+                        blue = fma(weight, batch[BLUE + i], blue)
+                    else:
+                        first = (channels + 1) * ids[start + i] + 1
+                        for k in range(channels):
+                            to = at + (k + 2) * LANES
+                            vstore(
+                                sums,
+                                to,
+                                fma(weight, values[first + k], vload(sums, to)),
+                            )
+                vstore(sums, at, before)
+                vstore(sums, at + LANES, depth)
+                vstore(reached, block * LANES, hits)
+                if channels == 3:
+                    vstore(sums, at + 2 * LANES, red)
+                    vstore(sums, at + 3 * LANES, green)
+                    vstore(sums, at + 4 * LANES, blue)
+                if mask_bits(before > 0.0) == 0:
                     alive &= ~(1 << block)
         close_tile(
-            tx,
-            ty,
-            width,
-            height,
-            channels,
-            with_depth,
-            background,
-            state,
-            sums,
-            out_colors,
-            out_depth,
-            out_alpha,
-        )
+            tx, ty, width, height, channels, with_depth, background, stride, sums, out_colors, out_depth, out_alpha
+        )  # fmt: skip
         if last is not None:
-            for at in range(0, PIXELS, 16):
-                transmittance = vload(state, at)
-                vstore(final_transmittance, tile * PIXELS + at, vmax(transmittance, -transmittance))
-                vstore(last, tile * PIXELS + at, vload(reached, at))
+            for block in range(16):
+                transmittance = vload(sums, block * stride)
+                to = tile * PIXELS + block * LANES
+                vstore(final_transmittance, to, vmax(transmittance, -transmittance))
+                vstore(last, to, vload(reached, block * LANES))
 
 
 @njit(nogil=True, cache=True)
 def close_tile(
-    tx, ty, width, height, channels, with_depth, background, state, sums, out_colors, out_depth, out_alpha
-):
+    tx, ty, width, height, channels, with_depth, background, stride, sums, out_colors, out_depth, out_alpha
+):  # fmt: skip
     """Writes a finished tile into the pictures, row by row."""
     for row in range(min(TILE, height - ty * TILE)):
         for column in range(min(TILE, width - tx * TILE)):
-            at = ((row >> 2) * 4 + (column >> 2)) * 16 + (row & 3) * 4 + (column & 3)
+            at = ((row >> 2) * 4 + (column >> 2)) * stride + (row & 3) * 4 + (column & 3)
             pixel = (ty * TILE + row) * width + tx * TILE + column
-            transmittance = abs(state[at])
+            transmittance = abs(sums[at])
             for k in range(channels):
-                out_colors[pixel * channels + k] = sums[k * PIXELS + at] + transmittance * background[k]
+                out_colors[pixel * channels + k] = sums[at + (k + 2) * LANES] + transmittance * background[k]
             alpha = np.float32(1.0) - transmittance
             out_alpha[pixel] = alpha
             if with_depth:
-                out_depth[pixel] = sums[channels * PIXELS + at] / alpha if alpha > 0.0 else np.float32(0.0)
+                out_depth[pixel] = sums[at + LANES] / alpha if alpha > 0.0 else np.float32(0.0)

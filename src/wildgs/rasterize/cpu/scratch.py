@@ -21,7 +21,7 @@ def scratch(name: str, size: int, dtype: type) -> Iterator[np.ndarray]:
     with _lock:
         array = _free.pop(name, None)
     if array is None or array.size < size:
-        array = np.empty(size + size // 4, dtype)
+        array = _aligned(size + size // 4, dtype)
     try:
         yield array[:size]
     finally:
@@ -29,6 +29,14 @@ def scratch(name: str, size: int, dtype: type) -> Iterator[np.ndarray]:
             kept = _free.get(name)
             if kept is None or kept.size < array.size:
                 _free[name] = array
+
+
+def _aligned(size: int, dtype: type) -> np.ndarray:
+    """A flat array that starts at a cache line."""
+    item = np.dtype(dtype).itemsize
+    raw = np.empty(size + 64 // item, dtype)
+    skip = -raw.ctypes.data % 64 // item
+    return raw[skip : skip + size]
 
 
 def release_scratch() -> None:

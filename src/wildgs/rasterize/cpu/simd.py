@@ -98,7 +98,12 @@ _binary(operator.add, VECTOR, lambda b, x, y: b.fadd(x, y, flags=_FLAGS))
 _binary(operator.sub, VECTOR, lambda b, x, y: b.fsub(x, y, flags=_FLAGS))
 _binary(operator.mul, VECTOR, lambda b, x, y: b.fmul(x, y, flags=_FLAGS))
 _binary(operator.truediv, VECTOR, lambda b, x, y: b.fdiv(x, y, flags=_FLAGS))
-for _op, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+for _op, _sign in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+):
     _binary(_op, MASK, lambda b, x, y, sign=_sign: b.fcmp_ordered(sign, x, y))
 
 
@@ -176,6 +181,26 @@ def vstore(typingctx, array, offset, value):
 
 
 @intrinsic
+def prefetch(typingctx, array, offset):
+    """Asks for the cache line of a C-contiguous array's flat element `offset`; any offset is safe."""
+    if not (isinstance(array, types.Array) and array.layout == "C" and isinstance(offset, types.Integer)):
+        return None
+
+    def codegen(context, builder, sig, args):
+        offset = context.cast(builder, args[1], sig.args[1], types.intp)
+        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+        byte_pointer = ir.IntType(8).as_pointer()
+        int32 = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte_pointer, int32, int32, int32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        hints = [ir.Constant(int32, number) for number in (0, 3, 1)]  # to read, keep in all caches, data
+        builder.call(function, [builder.bitcast(pointer, byte_pointer), *hints])
+        return context.get_dummy_value()
+
+    return types.void(array, offset), codegen
+
+
+@intrinsic
 def splat(typingctx, scalar):
     """The same number in every lane."""
     if not isinstance(scalar, types.Float | types.Integer):
@@ -244,7 +269,7 @@ def _fused(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.V
 
 @intrinsic
 def fma(typingctx, a, b, c):
-    """a * b + c, in one instruction where the processor has it."""
+    """A * b + c, in one instruction where the processor has it."""
     if not all(_is_operand(kind) for kind in (a, b, c)):
         return None
 
@@ -347,41 +372,74 @@ def vlog2(typingctx, value):
     return (VECTOR(value), codegen) if value is VECTOR else None
 
 
+def _columns_loader(count: int) -> Any:
+    def typing(typingctx, array, offset):
+        if not _flat_float_array(array):
+            return None
+        result = types.UniTuple(VECTOR, count)
+
+        def codegen(context, builder, sig, args):
+            offset = context.cast(builder, args[1], sig.args[1], types.intp)
+            base = _element_pointer(context, builder, sig.args[0], args[0], offset)
+            base = builder.bitcast(base, _VECTOR.as_pointer())
+            steps = [ir.Constant(ir.IntType(64), i) for i in range(count)]
+            vectors = [builder.load(builder.gep(base, [step]), align=4) for step in steps]
+            columns = [
+                _pick(builder, vectors, [lane * count + c for lane in range(LANES)]) for c in range(count)
+            ]
+            return context.make_tuple(builder, result, columns)
+
+        return result(array, offset), codegen
+
+    return intrinsic(typing)
+
+
+def _columns_storer(count: int) -> Any:
+    def typing(typingctx, array, offset, columns):
+        if not (_flat_float_array(array) and columns == types.UniTuple(VECTOR, count)):
+            return None
+
+        def codegen(context, builder, sig, args):
+            offset = context.cast(builder, args[1], sig.args[1], types.intp)
+            base = _element_pointer(context, builder, sig.args[0], args[0], offset)
+            base = builder.bitcast(base, _VECTOR.as_pointer())
+            columns = [builder.extract_value(args[2], i) for i in range(count)]
+            for i in range(count):
+                flat = [i * LANES + lane for lane in range(LANES)]
+                vector = _pick(builder, columns, [(f % count) * LANES + f // count for f in flat])
+                builder.store(vector, builder.gep(base, [ir.Constant(ir.IntType(64), i)]), align=4)
+            return context.get_dummy_value()
+
+        return types.void(array, offset, columns), codegen
+
+    return intrinsic(typing)
+
+
+def _pick(builder: ir.IRBuilder, vectors: list[ir.Value], sources: list[int]) -> ir.Value:
+    """A vector whose lanes come from the concatenation of several; one two-source shuffle for each but the first."""
+    result = vectors[0]
+    for i in range(1, len(vectors)):
+        numbers = []
+        for lane, source in enumerate(sources):
+            here = LANES + source % LANES if source // LANES == i else lane
+            numbers.append(source % LANES if i == 1 and source < LANES else here)
+        result = builder.shuffle_vector(result, vectors[i], ir.Constant(_INT_VECTOR, numbers))
+    return result
+
+
+# Rows of 2, 3, 4 or 8 floats, sixteen rows at once, as one vector per column: from (to) flat element `offset` on.
+vload2, vload3, vload4 = _columns_loader(2), _columns_loader(3), _columns_loader(4)
+vstore2, vstore3, vstore4, vstore8 = (_columns_storer(count) for count in (2, 3, 4, 8))
+
+
 @intrinsic
-def vgather(typingctx, array, offset, stride):
-    """Sixteen floats from a C-contiguous float32 array, `stride` flat elements apart."""
-    if not _flat_float_array(array):
-        return None
+def vfloor(typingctx, value):
+    """The largest whole number that is not above, per lane."""
 
     def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        offset, stride = (context.cast(builder, args[i], sig.args[i], types.intp) for i in (1, 2))
-        vector = ir.Constant(_VECTOR, ir.Undefined)
-        for lane in range(LANES):
-            value = builder.load(builder.gep(data, [offset]))
-            vector = builder.insert_element(vector, value, ir.Constant(ir.IntType(32), lane))
-            offset = builder.add(offset, stride)
-        return vector
+        return _call_vector_intrinsic(builder, "floor", args[0])
 
-    return VECTOR(array, offset, stride), codegen
-
-
-@intrinsic
-def vscatter(typingctx, array, offset, stride, value):
-    """Writes sixteen floats to a C-contiguous float32 array, `stride` flat elements apart."""
-    if not (_flat_float_array(array) and value is VECTOR):
-        return None
-
-    def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        offset, stride = (context.cast(builder, args[i], sig.args[i], types.intp) for i in (1, 2))
-        for lane in range(LANES):
-            scalar = builder.extract_element(args[3], ir.Constant(ir.IntType(32), lane))
-            builder.store(scalar, builder.gep(data, [offset]))
-            offset = builder.add(offset, stride)
-        return context.get_dummy_value()
-
-    return types.void(array, offset, stride, value), codegen
+    return (VECTOR(value), codegen) if value is VECTOR else None
 
 
 @intrinsic

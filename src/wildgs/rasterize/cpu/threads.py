@@ -85,5 +85,7 @@ def _announce() -> None:
     if not _announced.is_set():
         _announced.set()
         print(
-            "wildgs: compiling the CPU rasteriser's kernels (once; kept on disk)", file=sys.stderr, flush=True
+            "wildgs: compiling the CPU rasteriser's kernels (once; kept on disk)",
+            file=sys.stderr,
+            flush=True,
         )

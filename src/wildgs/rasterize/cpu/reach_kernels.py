@@ -1,0 +1,85 @@
+"""Numba (njit) functions that tell what a Gaussian reaches: pixels where its alpha is at least 1/255, an ellipse.
+
+The ellipse is tested against rectangles of pixel centres, exactly but for a slack that covers rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from wildgs.rasterize.cpu.simd import fma, lane_x, lane_y, mask_bits, vmax, vmin
+
+TILE = 16
+RECORD = 8  # floats per Gaussian: x, y, A, B, C, level, -B / 2C, -B / 2A; log2 alpha = A dx^2 + B dx dy + C dy^2 + level
+MIN_LEVEL = np.float32(-7.99435344)  # log2(1/255)
+REACH = np.float32(-7.99435344 - 0.01)
+HALF = np.float32(0.5)
+
+
+@njit(nogil=True, cache=True)
+def nearest_exponent(x0, y0, x1, y1, A, B, C, y_per_x, x_per_y):
+    """Largest value of A x^2 + B x y + C y^2 (negative definite) in the rectangle from (x0, y0) to (x1, y1).
+
+    It lies on the edge that faces the centre, horizontal or vertical. `y_per_x` is -B / 2C: where along a column
+    the value is largest; `x_per_y` likewise.
+    """
+    edge_x = vmin(vmax(x0, 0.0), x1)
+    edge_y = vmin(vmax(y0, 0.0), y1)
+    best_y = vmin(vmax(edge_x * y_per_x, y0), y1)
+    best_x = vmin(vmax(edge_y * x_per_y, x0), x1)
+    vertical = fma(edge_x, fma(A, edge_x, B * best_y), C * best_y * best_y)
+    horizontal = fma(best_x, fma(A, best_x, B * edge_y), C * edge_y * edge_y)
+    return vmax(vertical, horizontal)
+
+
+@njit(nogil=True, cache=True)
+def reach(x, y, side, A, B, C, level, y_per_x, x_per_y):
+    """Which squares of a 4 x 4 arrangement a Gaussian reaches, as 16 bits.
+
+    Args:
+        x: Centre of the arrangement's first pixel minus the Gaussian's, px.
+        y: Likewise.
+        side: Pixels along a square.
+        A: See `RECORD`, like all that follow.
+        B: -
+        C: -
+        level: -
+        y_per_x: -
+        x_per_y: -
+    """
+    x0 = lane_x() * side + x
+    y0 = lane_y() * side + y
+    more = side - np.float32(1.0)
+    best = nearest_exponent(x0, y0, x0 + more, y0 + more, A, B, C, y_per_x, x_per_y)
+    return mask_bits(best + level >= REACH)
+
+
+@njit(nogil=True, cache=True)
+def window_mask(i, records, tx, ty):
+    """Bits of the 4 x 4 tiles from tile (tx, ty) that the Gaussian of record i reaches."""
+    r = i * RECORD
+    return reach(
+        np.float32(tx * TILE) + HALF - records[r],
+        np.float32(ty * TILE) + HALF - records[r + 1],
+        np.float32(TILE),
+        records[r + 2], records[r + 3], records[r + 4], records[r + 5], records[r + 6], records[r + 7],
+    )  # fmt: skip
+
+
+@njit(nogil=True, cache=True)
+def inside_bits(tx, ty, last_x, last_y):
+    """Bits of a 4 x 4 window of tiles at (tx, ty) that lie no further than tile (last_x, last_y)."""
+    columns = (1 << min(last_x - tx + 1, 4)) - 1
+    rows = min(last_y - ty + 1, 4)
+    return (columns * 0x1111) & ((1 << (4 * rows)) - 1)
+
+
+@njit(nogil=True, cache=True)
+def count_bits(bits):
+    """How many bits are set."""
+    count = 0
+    while bits != 0:
+        bits &= bits - 1
+        count += 1
+    return count
