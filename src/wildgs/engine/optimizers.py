@@ -124,7 +124,9 @@ class Optimizers:
             prefix = f"{kind}.{index}."
             found = {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
             if found:
-                optimizer.state[parameter] = {key: value.to(parameter.device) for key, value in found.items()}
+                optimizer.state[parameter] = {
+                    key: _laid_out_as(parameter, value) for key, value in found.items()
+                }
 
     def _parameters(self) -> Iterator[tuple[str, int, Tensor, torch.optim.Adam]]:
         for kind, optimizer in (("rows", self.rows), ("networks", self.networks)):
@@ -132,6 +134,13 @@ class Optimizers:
                 parameters = [p for group in optimizer.param_groups for p in group["params"]]
                 for index, parameter in enumerate(parameters):
                     yield kind, index, parameter, optimizer
+
+
+def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
+    """A moment in its parameter's memory layout: fused Adam walks both as they lie."""
+    if value.shape != parameter.shape:
+        return value
+    return torch.empty_like(parameter, requires_grad=False).copy_(value)
 
 
 def _row_rate(config: OptimizerConfig, name: str, extent: float) -> float:

@@ -81,7 +81,7 @@ class Schedule:
 
     def mask_paused(self, step: int) -> bool:
         """Whether an opacity reset lies less than `mask_pause` steps back."""
-        last = min(step, self.densify_until) // self.reset_every * self.reset_every
+        last = min(step, self.densify_until - 1) // self.reset_every * self.reset_every
         return last > 0 and step - last < self.mask_pause
 
     def densifies(self, step: int) -> bool:

@@ -17,7 +17,7 @@ from wildgs.engine.schedule import Schedule, ScheduleConfig
 from wildgs.errors import UserError
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
-from wildgs.model.precision import Precision, choose_precision, set_precision
+from wildgs.model.precision import Precision, choose_precision, lay_out_channels_last, set_precision
 
 PREPARATION_PHOTOS = 16
 
@@ -95,6 +95,7 @@ class Trainer:
         self.seconds = 0.0
         self.schedule = Schedule(config.schedule, config.steps)
         self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
+        lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent)
         self.density = DensityControl(config.density, extent, len(method.gaussians))

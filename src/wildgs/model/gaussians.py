@@ -11,6 +11,9 @@ from wildgs.geometry.camera import Camera
 from wildgs.rasterize import Projection, project
 
 INITIAL_OPACITY = 0.1
+NEAR = 0.05
+"""Near plane; the aligned frame's unit is the photos' median depth. What people in the way leave behind floats
+right before single cameras: nearer than this there is nothing of a landmark to see."""
 
 
 class Gaussians(nn.Module):
@@ -57,7 +60,7 @@ class Gaussians(nn.Module):
 
     def project(self, camera: Camera, *, absgrad: bool = False) -> Projection:
         """Projects and bins all Gaussians for one camera."""
-        return project(self.means, self.quats, self.scales, self.opacities, camera, absgrad=absgrad)
+        return project(self.means, self.quats, self.scales, self.opacities, camera, near=NEAR, absgrad=absgrad)
 
 
 def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:

@@ -23,13 +23,19 @@ class MixedModule(nn.Module):
 
 
 def set_precision(module: nn.Module, precision: torch.dtype) -> None:
-    """Sets the precision of all networks inside a module.
-
-    Convolutions are laid out channels-last, which is faster for both precisions on CPUs and tensor cores.
-    """
+    """Sets the precision of all networks inside a module."""
     for part in module.modules():
         if isinstance(part, MixedModule):
             part.precision = precision
+
+
+def lay_out_channels_last(module: nn.Module) -> None:
+    """Lays out the networks' convolutions channels-last: faster on CPUs and on tensor cores.
+
+    Call it before optimisers are made, whose state follows the parameters' layout.
+    """
+    for part in module.modules():
+        if isinstance(part, MixedModule):
             part.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 

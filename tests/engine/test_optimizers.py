@@ -1,0 +1,79 @@
+"""Row edits keep parameters and Adam's state together."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wildgs.engine.optimizers import OptimizerConfig, Optimizers, edit_rows, reset_moments
+from wildgs.model.vanilla import VanillaGS
+
+
+def trained_baseline(count: int = 12) -> tuple[VanillaGS, Optimizers]:
+    """A baseline after one step whose moments tell every row apart."""
+    torch.manual_seed(0)
+    method = VanillaGS.from_points(torch.randn(count, 3), torch.zeros(count, 3, dtype=torch.uint8))
+    optimizers = Optimizers.build(method, OptimizerConfig(), extent=2.0)
+    for parameter in method.gaussians.parameters():
+        numbers = torch.arange(1.0, count + 1).reshape(-1, *[1] * (parameter.dim() - 1))
+        parameter.grad = numbers.expand_as(parameter).clone()
+    optimizers.step()
+    return method, optimizers
+
+
+def moments(method: VanillaGS, optimizers: Optimizers, name: str) -> torch.Tensor:
+    return optimizers.rows.state[method.gaussians.rows[name]]["exp_avg"]
+
+
+@given(st.lists(st.booleans(), min_size=12, max_size=12), st.integers(0, 5))
+@settings(max_examples=20, deadline=None)
+def test_rows_and_moments_stay_aligned(kept: list[bool], added: int) -> None:
+    method, optimizers = trained_baseline()
+    gaussians, keep = method.gaussians, torch.tensor(kept)
+    before = {name: rows.detach().clone() for name, rows in gaussians.rows.items()}
+    old_moments = {name: moments(method, optimizers, name).clone() for name in before}
+    new = {name: torch.randn(added, *rows.shape[1:]) for name, rows in before.items()}
+    edit_rows(gaussians, optimizers.rows, keep, new)
+    for name in before:
+        expected = torch.cat([before[name][keep], new[name]])
+        assert torch.equal(gaussians.rows[name].detach(), expected)
+        state = moments(method, optimizers, name)
+        assert torch.equal(state[: int(keep.sum())], old_moments[name][keep])
+        assert state[int(keep.sum()) :].abs().sum() == 0
+    assert len(optimizers.rows.state) == len(before)
+
+
+def test_training_goes_on_after_an_edit() -> None:
+    method, optimizers = trained_baseline()
+    rows = {name: rows.detach()[:2] for name, rows in method.gaussians.rows.items()}
+    edit_rows(method.gaussians, optimizers.rows, torch.ones(12, dtype=torch.bool), rows)
+    before = method.gaussians.means.detach().clone()
+    method.gaussians.means.sum().backward()
+    optimizers.step()
+    assert (method.gaussians.means.detach() < before).all()
+
+
+def test_reset_clears_one_row_only() -> None:
+    method, optimizers = trained_baseline()
+    reset_moments(optimizers.rows, method.gaussians, "opacity_logits")
+    assert moments(method, optimizers, "opacity_logits").abs().sum() == 0
+    assert moments(method, optimizers, "means").abs().sum() > 0
+
+
+@pytest.mark.parametrize(("progress", "expected"), [(0.0, 1.6e-4), (1.0, 1.6e-6), (0.5, 1.6e-5)])
+def test_position_rate_falls_exponentially_and_scales_with_the_scene(progress: float, expected: float) -> None:
+    _, optimizers = trained_baseline()
+    optimizers.set_progress(progress)
+    rates = {group["name"]: group["lr"] for group in optimizers.rows.param_groups}
+    assert rates["means"] == pytest.approx(expected * 2.0)
+    assert rates["log_scales"] == pytest.approx(5e-3)
+
+
+def test_state_goes_round() -> None:
+    method, optimizers = trained_baseline()
+    fresh = Optimizers.build(method, OptimizerConfig(), extent=2.0)
+    fresh.restore(optimizers.state())
+    for name in method.gaussians.rows:
+        assert torch.equal(moments(method, fresh, name), moments(method, optimizers, name))

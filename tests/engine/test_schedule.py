@@ -1,0 +1,59 @@
+"""Schedules: the paper's at its own length, scaled otherwise."""
+
+from __future__ import annotations
+
+import pytest
+
+from wildgs.engine.schedule import Schedule, ScheduleConfig, exponential
+
+
+def test_paper_length_keeps_the_papers_steps() -> None:
+    schedule = Schedule(ScheduleConfig(), 30_000)
+    assert [schedule.first_stage, schedule.densify_from, schedule.densify_until] == [3000, 500, 15_000]
+    assert [schedule.densify_every, schedule.reset_every, schedule.sh_every] == [100, 3000, 1000]
+    assert schedule.densifies(600)
+    assert not schedule.densifies(500)
+    assert not schedule.densifies(650)
+    assert not schedule.densifies(15_000)
+    assert [step for step in range(0, 30_000) if schedule.resets(step)] == [3000, 6000, 9000, 12_000]
+
+
+def test_half_length_halves() -> None:
+    schedule = Schedule(ScheduleConfig(), 15_000)
+    assert schedule.first_stage == 1500
+    assert schedule.densify_until == 7500
+
+
+@pytest.mark.parametrize("steps", [1, 50, 300, 3000])
+def test_short_runs_stay_sane(steps: int) -> None:
+    schedule = Schedule(ScheduleConfig(), steps)
+    resets = [step for step in range(steps) if schedule.resets(step)]
+    assert all(step < steps / 2 for step in resets)
+    assert schedule.first_stage <= max(1, steps // 5)
+    assert schedule.progress(0) in (0.0, 1.0)
+    assert schedule.progress(steps - 1) == (1.0 if steps > 1 else 0.0)
+
+
+def test_stages() -> None:
+    schedule = Schedule(ScheduleConfig(), 30_000)
+    assert not schedule.stage(2999, 3).explicit
+    assert schedule.stage(3000, 3).explicit
+    assert [schedule.stage(step, 3).sh_degree for step in (0, 999, 1000, 2500, 29_999)] == [0, 0, 1, 2, 3]
+
+
+def test_mask_rests_after_every_reset_and_only_then() -> None:
+    schedule = Schedule(ScheduleConfig(), 30_000)
+    assert not schedule.mask_paused(0)
+    assert not schedule.mask_paused(2999)
+    assert schedule.mask_paused(3000)
+    assert schedule.mask_paused(3499)
+    assert not schedule.mask_paused(3500)
+    assert schedule.mask_paused(12_100)
+    assert not schedule.mask_paused(15_100), "there is no reset at the end of densification"
+    assert not schedule.mask_paused(18_100), "there is no reset after densification"
+
+
+def test_exponential_ends() -> None:
+    assert exponential(1.0, 0.01, 0.0) == pytest.approx(1.0)
+    assert exponential(1.0, 0.01, 0.5) == pytest.approx(0.1)
+    assert exponential(1.0, 0.01, 1.0) == pytest.approx(0.01)
