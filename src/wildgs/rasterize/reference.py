@@ -54,9 +54,7 @@ def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int,
 
 def _sound(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
     """Gaussians that are finite and not transparent; others would spread NaN through the gradients."""
-    finite = torch.stack([t.reshape(len(means), -1).isfinite().all(-1) for t in (means, quats, scales)]).all(
-        0
-    )
+    finite = means.isfinite().all(-1) & quats.isfinite().all(-1) & scales.isfinite().all(-1)
     return finite & opacities.isfinite() & (opacities >= MIN_ALPHA)
 
 

@@ -102,14 +102,14 @@ class _Project(torch.autograd.Function):
         outputs: Any,
     ) -> Any:
         means2d, depths, conics, radii = outputs
-        ctx.save_for_backward(means, quats, scales, conics, radii)
+        ctx.save_for_backward(means, quats, scales, radii)
         ctx.lens = lens
-        return means2d, depths, conics.clone()
+        return means2d, depths, conics
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         v_means2d, v_depths, v_conics = grads
-        means, quats, scales, conics, radii = ctx.saved_tensors
+        means, quats, scales, radii = ctx.saved_tensors
         outputs = (
             torch.empty_like(means),
             torch.empty_like(quats),
@@ -119,7 +119,7 @@ class _Project(torch.autograd.Function):
             geometry_kernels.project_backward,
             *map(_flat, (means, quats, scales)),
             *ctx.lens.arguments(),
-            *map(_flat, (conics, radii, v_means2d, v_depths, v_conics)),
+            *map(_flat, (radii, v_means2d, v_depths, v_conics)),
             *map(_flat, outputs),
             items=_chunks(len(means)),
         )
@@ -285,7 +285,7 @@ class _Blend(torch.autograd.Function):
                 backward_kernels.blend_backward,
                 tiles.tile_order, tiles.offsets, tiles.ids, tiles.slots, tiles.records,
                 _rank_values(tiles, depths, colors), channels, ctx.with_depth, _flat(background),
-                ctx.camera.width, ctx.camera.height, ctx.transmittance, ctx.last, _flat(out_depth),
+                ctx.camera.width, ctx.camera.height, ctx.transmittance, ctx.last, _flat(out_depth), _flat(out_alpha),
                 _flat(v_colors), _flat(v_depth), _flat(v_alpha), stride, rows, absgrad is not None,
             )  # fmt: skip
             launch(

@@ -63,7 +63,7 @@ BEHIND, REACHED, V_ALPHA, V_DEPTH, V_COLORS = 16, 32, 48, 64, 80
 
 @njit(nogil=True, cache=True)
 def load_tile(
-    tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth,
+    tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth, out_alpha,
     v_colors, v_depth, v_alpha, stride, v,
 ):  # fmt: skip
     """Gathers a tile's state and incoming gradients by block (see the offsets at the top)."""
@@ -80,7 +80,7 @@ def load_tile(
             for k in range(channels):
                 v[at + V_COLORS + k * LANES] = v_colors[pixel * channels + k]
                 total -= v_colors[pixel * channels + k] * background[k]
-            alpha = np.float32(1.0) - v[at]
+            alpha = out_alpha[pixel]
             if with_depth and alpha > 0.0:
                 share = v_depth[pixel] / alpha
                 v[at + V_DEPTH] = share
@@ -91,7 +91,7 @@ def load_tile(
 @njit(nogil=True, cache=True)
 def blend_backward(
     counter, tile_order, offsets, ids, slots, records, values, channels, with_depth, background,
-    width, height, final_transmittance, last, out_depth, v_colors, v_depth, v_alpha, row_size, rows, absgrad,
+    width, height, final_transmittance, last, out_depth, out_alpha, v_colors, v_depth, v_alpha, row_size, rows, absgrad,
 ):  # fmt: skip
     """Writes one row of `row_size` floats per (tile, Gaussian) pair into `rows`, at the pair's slot."""
     tiles_x = (width + TILE - 1) // TILE
@@ -113,7 +113,7 @@ def blend_backward(
         tx, ty = tile % tiles_x, tile // tiles_x
         begin = offsets[tile]
         load_tile(
-            tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth,
+            tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth, out_alpha,
             v_colors, v_depth, v_alpha, stride, v,
         )  # fmt: skip
         end = 0

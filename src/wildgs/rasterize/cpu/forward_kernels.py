@@ -3,7 +3,7 @@
 A tile of 16 x 16 pixels is sixteen blocks of 4 x 4; a block is one vector. For each Gaussian of the tile's list
 only the blocks that it reaches and that still let light through are visited.
 
-A block's numbers lie together in memory: transmittance, depth sum, then the channels' sums. Transmittance doubles as
+A block's numbers lie together in memory: transmittance, alpha and depth sums, then the channels' sums. Transmittance doubles as
 the pixels' state: negative where the pixel is saturated (its value is the magnitude) or outside the picture.
 """
 
@@ -141,7 +141,7 @@ def blend_forward(
     and block for the backward pass; they are None where there will be none.
     """
     tiles_x = (width + TILE - 1) // TILE
-    stride = (channels + 2) * LANES
+    stride = (channels + 3) * LANES
     sums = aligned(16 * stride)
     reached = aligned(PIXELS)
     batch = aligned(FIELDS * BATCH)
@@ -168,18 +168,12 @@ def blend_forward(
                 at = block * stride
                 px = lane_x() + np.float32((block & 3) * 4)
                 py = lane_y() + np.float32((block >> 2) * 4)
-                before, depth, hits = (
-                    vload(sums, at),
-                    vload(sums, at + LANES),
-                    vload(reached, block * LANES),
-                )
+                before, total, depth = vload(sums, at), vload(sums, at + LANES), vload(sums, at + 2 * LANES)
+                hits = vload(reached, block * LANES)
                 red, green, blue = splat(0.0), splat(0.0), splat(0.0)
                 if channels == 3:
-                    red, green = (
-                        vload(sums, at + 2 * LANES),
-                        vload(sums, at + 3 * LANES),
-                    )
-                    blue = vload(sums, at + 4 * LANES)
+                    red, green = vload(sums, at + 3 * LANES), vload(sums, at + 4 * LANES)
+                    blue = vload(sums, at + 5 * LANES)
                 while word != 0:
                     i = lowest_bit(word)
                     word &= word - 1
@@ -193,6 +187,7 @@ def blend_forward(
                     after = before - weight
                     kept = hit & (after > MIN_TRANSMITTANCE)
                     weight = select(kept, weight, 0.0)
+                    total = total + weight
                     before = select(kept, after, select(hit, -before, before))
                     if last is not None:
                         hits = select(kept, splat(np.float32(start - begin + i + 1)), hits)
@@ -205,19 +200,20 @@ def blend_forward(
                     else:
                         first = (channels + 1) * ids[start + i] + 1
                         for k in range(channels):
-                            to = at + (k + 2) * LANES
+                            to = at + (k + 3) * LANES
                             vstore(
                                 sums,
                                 to,
                                 fma(weight, values[first + k], vload(sums, to)),
                             )
                 vstore(sums, at, before)
-                vstore(sums, at + LANES, depth)
+                vstore(sums, at + LANES, total)
+                vstore(sums, at + 2 * LANES, depth)
                 vstore(reached, block * LANES, hits)
                 if channels == 3:
-                    vstore(sums, at + 2 * LANES, red)
-                    vstore(sums, at + 3 * LANES, green)
-                    vstore(sums, at + 4 * LANES, blue)
+                    vstore(sums, at + 3 * LANES, red)
+                    vstore(sums, at + 4 * LANES, green)
+                    vstore(sums, at + 5 * LANES, blue)
                 if mask_bits(before > 0.0) == 0:
                     alive &= ~(1 << block)
         close_tile(
@@ -242,8 +238,9 @@ def close_tile(
             pixel = (ty * TILE + row) * width + tx * TILE + column
             transmittance = abs(sums[at])
             for k in range(channels):
-                out_colors[pixel * channels + k] = sums[at + (k + 2) * LANES] + transmittance * background[k]
-            alpha = np.float32(1.0) - transmittance
+                out_colors[pixel * channels + k] = sums[at + (k + 3) * LANES] + transmittance * background[k]
+            # Summed, not 1 - transmittance: what is faint would have few digits left.
+            alpha = min(sums[at + LANES], np.float32(1.0))
             out_alpha[pixel] = alpha
             if with_depth:
-                out_depth[pixel] = sums[at + LANES] / alpha if alpha > 0.0 else np.float32(0.0)
+                out_depth[pixel] = sums[at + 2 * LANES] / alpha if alpha > 0.0 else np.float32(0.0)

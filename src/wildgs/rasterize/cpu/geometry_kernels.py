@@ -272,7 +272,7 @@ def footprint(i, quats, scales, R, lens, width, height, x, y, z, iz):
 
 @njit(nogil=True, cache=True)
 def project_backward(
-    counter, means, quats, scales, view, lens, width, height, conics, radii,
+    counter, means, quats, scales, view, lens, width, height, radii,
     v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
 ):  # fmt: skip
     """Gradients of means, quaternions and scales from those of centres, depths and conics."""
@@ -291,7 +291,7 @@ def project_backward(
                 any_seen |= radii[i + lane] > 0
             if any_seen:
                 project_group_backward(
-                    i, seen, means, quats, scales, view, lens, width, height, conics,
+                    i, seen, means, quats, scales, view, lens, width, height,
                     v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
                 )  # fmt: skip
             else:
@@ -302,7 +302,7 @@ def project_backward(
 
 @njit(nogil=True, cache=True)
 def project_group_backward(
-    i, seen, means, quats, scales, view, lens, width, height, conics,
+    i, seen, means, quats, scales, view, lens, width, height,
     v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
 ):  # fmt: skip
     """The chain rule through `project_group` for sixteen Gaussians."""
@@ -316,18 +316,16 @@ def project_group_backward(
     u, V, rest = footprint(i, quats, scales, R, lens, width, height, x, y, z, iz)
     shrink, qw, qx, qy, qz, tx, ty = rest
 
-    # conic = cov^-1, so d cov = -conic d conic conic.
-    a, b, c = vload3(conics, 3 * i)
+    # conic = (c, -b, a) / (a c - b b). By way of the conics themselves a needle's small eigenvalue would be lost.
+    a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + DILATION
+    b = u[0] * u[3] + u[1] * u[4] + u[2] * u[5]
+    c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + DILATION
+    scale = 1.0 / select(ok, a * c - b * b, 1.0)
     ga, gb, gc = vload3(v_conics, 3 * i)
     v_mx, v_my = vload2(v_means2d, 2 * i)
-    gb = 0.5 * gb
-    p00, p01 = ga * a + gb * b, ga * b + gb * c
-    p10, p11 = gb * a + gc * b, gb * b + gc * c
-    v_a, v_b, v_c = (
-        -(a * p00 + b * p10),
-        -2.0 * (a * p01 + b * p11),
-        -(b * p01 + c * p11),
-    )
+    ga, gb, gc = ga * scale, gb * scale, gc * scale
+    v_det = (gb * b - ga * c - gc * a) * scale
+    v_a, v_b, v_c = gc + v_det * c, -gb - 2.0 * v_det * b, ga + v_det * a
 
     g = (
         2.0 * v_a * u[0] + v_b * u[3], 2.0 * v_a * u[1] + v_b * u[4], 2.0 * v_a * u[2] + v_b * u[5],
