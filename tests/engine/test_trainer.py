@@ -1,0 +1,136 @@
+"""Training end to end on a scene in memory: it learns, it observes, it resumes to the same bits."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from wildgs.data import Scene
+from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
+from wildgs.engine.recorder import Recorder
+from wildgs.engine.schedule import ScheduleConfig
+from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.model.registry import MethodName, create_method, restore_method
+from wildgs.model.wildgs import WildGSConfig
+
+pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
+
+
+def trainer_for(scene: Scene, model: WildGSConfig, steps: int, method: MethodName = "wildgs", **config) -> Trainer:
+    torch.manual_seed(0)
+    made = create_method(method, model, scene.points, scene.point_colors)
+    return Trainer(made, scene, TrainConfig(steps=steps, precision="float32", **config))
+
+
+@pytest.mark.parametrize("method", ["wildgs", "3dgs"])
+def test_loss_falls(wall_scene: Scene, tiny_model: WildGSConfig, method: MethodName) -> None:
+    trainer = trainer_for(wall_scene, tiny_model, 120, method)
+    losses: list[float] = []
+    trainer.run([lambda report: losses.append(float(report.losses.image.detach()))])
+    assert trainer.step == 120
+    assert len(losses) == 120
+    assert sum(losses[-14:]) < 0.6 * sum(losses[:14])
+
+
+def test_wildgs_separates_lights_that_the_baseline_averages(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    errors = {}
+    for method in ("wildgs", "3dgs"):
+        trainer = trainer_for(wall_scene, tiny_model, 250, method)
+        trainer.run()
+        view = wall_scene.test_views[0]
+        photo = view.read_photo().float() / 255
+        with torch.no_grad():
+            sh = trainer.method.shade(trainer.method.encode(photo, view.camera))
+            errors[method] = float((trainer.method.render(view.camera, sh).colors - photo).square().mean())
+    assert errors["wildgs"] < 0.5 * errors["3dgs"]
+
+
+def test_first_stage_has_neither_triplane_nor_depth_loss(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    trainer = trainer_for(wall_scene, tiny_model, 60, schedule=ScheduleConfig(first_stage=15_000))
+    depth: list[float] = []
+    planes = next(trainer.method.wrapping.unet.parameters())  # pyright: ignore[reportAttributeAccessIssue]
+    before = planes.detach().clone()
+    untouched: list[bool] = []
+
+    def watch(report: StepReport) -> None:
+        depth.append(float(report.losses.depth.detach()))
+        untouched.append(torch.equal(planes.detach(), before))
+
+    trainer.run([watch])
+    assert depth[:30] == [0.0] * 30
+    assert any(value != 0 for value in depth[30:])
+    assert untouched[29]
+    assert not untouched[-1]
+
+
+def test_without_depth_there_is_no_depth_loss(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    trainer = trainer_for(wall_scene, replace(tiny_model, without=("depth",)), 30)
+    depth: list[float] = []
+    trainer.run([lambda report: depth.append(float(report.losses.depth.detach()))])
+    assert set(depth) == {0.0}
+
+
+@pytest.mark.parametrize("method", ["wildgs", "3dgs"])
+def test_resumed_run_ends_in_the_same_bits(
+    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path, method: MethodName
+) -> None:
+    schedule = ScheduleConfig(densify_from=20 * 250, densify_every=10 * 250, reset_every=30 * 250, first_stage=2000)
+    whole = trainer_for(wall_scene, tiny_model, 120, method, schedule=schedule)
+    whole.run([lambda r: save_checkpoint(tmp_path, r.step, whole.state(), {}) if r.step == 70 else None])
+    checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
+    resumed = Trainer(restore_method(method, tiny_model, checkpoint.method), wall_scene, whole.config)
+    resumed.restore(checkpoint.state)
+    assert resumed.step == 70
+    resumed.run()
+    expected, got = whole.state(), resumed.state()
+    different = [
+        name for name in expected if name != "progress.seconds" and not torch.equal(expected[name], got[name])
+    ]
+    assert different == []
+
+
+def test_a_scene_without_training_photos_is_a_users_mistake(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    with pytest.raises(UserError, match="no photo to train on"):
+        trainer_for(replace(wall_scene, views=wall_scene.test_views), tiny_model, 10)
+
+
+def test_recorder_leaves_lines_and_a_board(wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path) -> None:
+    trainer = trainer_for(wall_scene, tiny_model, 20)
+    with Recorder(tmp_path, scalars_every=5, pictures_every=20) as recorder:
+        trainer.run([recorder])
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [5, 10, 15, 20]
+    assert {"image", "mask", "depth", "total", "num_gaussians", "steps_per_second", "visibility"} <= set(lines[0])
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert "train/total" in board.Tags()["scalars"]
+    assert {"train/photo", "train/render", "train/visibility", "train/depth"} <= set(board.Tags()["images"])
+
+
+def test_checkpoints_keep_two_and_refuse_damage(tmp_path: Path) -> None:
+    for step in (1, 2, 3):
+        save_checkpoint(tmp_path, step, {"x": torch.full((4,), float(step))}, {"note": "ä"})
+    kept = list_checkpoints(tmp_path)
+    assert [path.name for path in kept] == ["step_00000002.safetensors", "step_00000003.safetensors"]
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [path.name for path in kept], "nothing half written"
+    checkpoint = load_checkpoint(kept[-1])
+    assert checkpoint.header == {"note": "ä"}
+    assert torch.equal(checkpoint.state["x"], torch.full((4,), 3.0))
+    kept[-1].write_bytes(kept[-1].read_bytes()[:40])
+    with pytest.raises(UserError, match="not a readable checkpoint"):
+        load_checkpoint(kept[-1])
+
+
+def test_missing_pretrained_weights_do_not_stop_training(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    missing = replace(tiny_model, parsing=replace(tiny_model.parsing, encoder="nobody/no-such-network"))
+    with pytest.warns(WildGSWarning, match="learnt from scratch"):
+        trainer = trainer_for(wall_scene, missing, 2)
+    trainer.run()
+    assert trainer.step == 2
