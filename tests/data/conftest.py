@@ -98,3 +98,40 @@ def make_scene(tmp_path: Path) -> Callable[..., Path]:
         return root
 
     return make
+
+
+def render_corner(
+    count: int, width: int = 320, height: int = 240
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Photos of a textured floor and wall, and the cameras' positions: enough for structure from motion."""
+    rng = np.random.default_rng(7)
+    # Blots of many sizes, so that features are found at many scales.
+    texture = sum(
+        np.kron(rng.uniform(size=(512 // size, 512 // size, 3)), np.ones((size, size, 1))) * size**0.5
+        for size in (2, 4, 8, 16, 32)
+    )
+    texture = 255 * (texture - texture.min()) / np.ptp(texture)
+    focal, photos, positions = 1.2 * width, [], []
+    y, x = np.mgrid[0:height, 0:width]
+    rays = np.stack(
+        [(x + 0.5 - width / 2) / focal, (y + 0.5 - height / 2) / focal, np.ones(x.shape)], axis=-1
+    )
+    for index in range(count):
+        position = np.array([-1.5 + 3 * index / max(count - 1, 1), -5.0 + 0.5 * (index % 2), 1.5])
+        pose = look_at(position, np.array([0.0, 0.5, 0.5]), np.array([0.0, 0.0, 1.0]))
+        directions = rays @ pose[:, :3]
+        with np.errstate(divide="ignore"):
+            floor = np.where(directions[..., 2] < 0, -position[2] / directions[..., 2], np.inf)
+            wall = np.where(directions[..., 1] > 0, (2 - position[1]) / directions[..., 1], np.inf)
+        points = position + np.minimum(floor, wall)[..., None] * directions
+        u, v = points[..., 0], np.where(floor < wall, points[..., 1], 5 + points[..., 2])
+        rows, columns = (v * 80).astype(int) % 512, (u * 80).astype(int) % 512
+        photos.append(texture[rows, columns].astype(np.uint8))
+        positions.append(position)
+    return photos, positions
+
+
+@pytest.fixture(scope="session")
+def corner() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Six photos of a textured corner, and where they were taken."""
+    return render_corner(6)

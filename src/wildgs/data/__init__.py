@@ -1,5 +1,11 @@
 """Photos, cameras and sparse points: from a folder to a `Scene`."""
 
+# First of all the libraries that load the system's zlib: pycolmap exports a zlib of its own, and one that is
+# loaded after it would mix its functions with pycolmap's and corrupt the memory when a PNG is written.
+import zlib  # noqa: F401
+
+import PIL.Image  # noqa: F401
+
 from wildgs.data.loading import DataConfig, load_scene
 from wildgs.data.scene import Alignment, Scene, Split, View, scene_extent
 

@@ -86,34 +86,33 @@ def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, p
     options.max_image_size = config.max_image_size
     options.num_threads = config.threads
     options.sift.max_num_features = config.max_features
-    reader = pycolmap.ImageReaderOptions()
-    if work.masks.is_dir():
-        reader.mask_path = work.masks
-    for start in range(0, len(copies), EXTRACTION_BATCH):
-        progress("finding features", start, len(copies))
-        pycolmap.extract_features(
-            work.database,
-            work.images,
-            [copy.work_name for copy in copies[start : start + EXTRACTION_BATCH]],
-            pycolmap.CameraMode.PER_IMAGE,
-            reader_options=reader,
-            extraction_options=options,
-        )
-    progress("finding features", len(copies), len(copies))
+    done = 0
+    # COLMAP passes over photos without a mask once it is given a folder of masks, so these go apart.
+    for masked in (False, True):
+        reader = pycolmap.ImageReaderOptions()
+        if masked:
+            reader.mask_path = work.masks
+        names = [copy.work_name for copy in copies if copy.masked == masked]
+        for start in range(0, len(names), EXTRACTION_BATCH):
+            progress("finding features", done, len(copies))
+            batch = names[start : start + EXTRACTION_BATCH]
+            pycolmap.extract_features(
+                work.database,
+                work.images,
+                batch,
+                pycolmap.CameraMode.PER_IMAGE,
+                reader_options=reader,
+                extraction_options=options,
+            )
+            done += len(batch)
+    progress("finding features", done, len(copies))
 
 
 def match(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> Pairing:
     """Choose the pairs, match their features and verify the matches by epipolar geometry."""
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
-        index = {image_id: position for position, image_id in enumerate(ids) if image_id is not None}
-        positions = {
-            index[prior.corr_data_id.id]: (float(prior.position[0]), float(prior.position[1]))
-            for prior in database.read_all_pose_priors()
-            if prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84
-            and prior.corr_data_id.id in index
-            and np.isfinite(prior.position[:2]).all()
-        }
+        positions = {i: copy.position for i, copy in enumerate(copies) if copy.position is not None}
 
         def descriptors(photo: int) -> np.ndarray:
             image_id = ids[photo]

@@ -38,12 +38,14 @@ class WorkingCopy:
             space.
         scene_name: Path that the photo gets in the scene: the original's, as .jpg; unique by its stem.
         masked: Whether the photo's transparent pixels were written as a mask beside the copy.
+        position: Latitude and longitude by GPS in degrees, None where the photo carries none.
     """
 
     name: str
     work_name: str
     scene_name: str
     masked: bool
+    position: tuple[float, float] | None = None
 
 
 def list_photos(folder: Path) -> list[str]:
@@ -114,10 +116,10 @@ def copy_upright(
     def copy(plan: tuple[str, str, str]) -> WorkingCopy | str:
         name, work_name, scene_name = plan
         try:
-            masked = _copy_one(folder / name, images_dir / work_name, masks_dir, max_pixels)
+            masked, position = _copy_one(folder / name, images_dir / work_name, masks_dir, max_pixels)
         except UnreadableImageError as error:
             return str(error)
-        return WorkingCopy(name, work_name, scene_name, masked)
+        return WorkingCopy(name, work_name, scene_name, masked, position)
 
     copies, broken = [], {}
     with ThreadPoolExecutor(COPIERS) as pool:
@@ -134,19 +136,41 @@ def copy_upright(
     return copies, broken
 
 
-def _copy_one(source: Path, target: Path, masks_dir: Path, max_pixels: int) -> bool:
-    """Copy one photo; whether a mask was written."""
+def _copy_one(
+    source: Path, target: Path, masks_dir: Path, max_pixels: int
+) -> tuple[bool, tuple[float, float] | None]:
+    """Copy one photo; whether a mask was written, and where the photo was taken."""
     photo = read_photo(source, max_pixels=max_pixels)
     with open_image(source, max_pixels) as image:
+        position = gps_position(image)
         if image.format == "JPEG" and image.mode == "RGB" and _orientation(image) == 1:
             shutil.copyfile(source, target)  # as it is: encoding it again would lose a little
-            return False
+            return False, position
         _save_jpeg(photo, image, target)
     if photo.opaque is None or photo.opaque.all():
-        return False
+        return False, position
     masks_dir.mkdir(parents=True, exist_ok=True)
     Image.fromarray(photo.opaque).save(masks_dir / f"{target.name}.png")
-    return True
+    return True, position
+
+
+def gps_position(image: Image.Image) -> tuple[float, float] | None:
+    """Latitude and longitude in degrees from the EXIF block; None where it has none that makes sense.
+
+    COLMAP reads positions, too, but only those with an altitude.
+    """
+    try:
+        gps = image.getexif().get_ifd(GPS_IFD)
+        latitude, longitude = (
+            sum(float(part) / unit for part, unit in zip(gps[tag], (1, 60, 3600), strict=True))
+            for tag in (2, 4)
+        )
+        latitude *= -1 if str(gps[1]).upper().startswith("S") else 1
+        longitude *= -1 if str(gps[3]).upper().startswith("W") else 1
+    except Exception:  # absent or broken
+        return None
+    sensible = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0.0, 0.0)
+    return (latitude, longitude) if sensible else None
 
 
 def _save_jpeg(photo: Photo, original: Image.Image, target: Path) -> None:

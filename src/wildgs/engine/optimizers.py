@@ -42,7 +42,7 @@ class OptimizerConfig:
     shN: float = 1.25e-4  # noqa: N815 - the field's name
     intrinsic: float = 2.5e-3
     networks: float = 1e-3
-    encoder: float = 3e-4
+    encoder: float = 1e-3
     network_decay: float = 0.1
 
 

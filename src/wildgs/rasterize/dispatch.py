@@ -66,6 +66,7 @@ def project(
     backend: BackendName | None = None,
     near: float = 0.01,
     absgrad: bool = False,
+    packed: bool = False,
 ) -> Projection:
     """Projects Gaussians into a camera and sorts them into tiles, for any number of `blend` calls.
 
@@ -77,11 +78,13 @@ def project(
         means: Centres, world units.
         quats: Orientations (wxyz), of any length but 0.
         scales: Standard deviations along the own axes, world units, linear (no logarithm).
-        opacities: In [0, 1].
+        opacities: In [0, 1]; larger ones count as 1.
         camera: The camera; no gradient flows to it.
         backend: Which implementation; None takes `cuda` for tensors on CUDA and `cpu` otherwise.
         near: Depth in world units up to which Gaussians are culled.
         absgrad: Collect absolute screen gradients in `Projection.absgrad` during the backward pass.
+        packed: gsplat's packed mode, which needs less memory where few Gaussians are seen; only the backend `cuda`
+            has it, others go their way regardless.
 
     Raises:
         ValueError: Shapes, devices or number types do not fit, or there is no such backend.
@@ -99,7 +102,8 @@ def project(
         _check(name, tensor, shape, means, backend)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the camera's picture has no pixels: {camera.width} x {camera.height}")
-    return module.project(means, quats, scales, opacities, camera, near, absgrad)
+    options = {"packed": packed} if backend == "cuda" else {}
+    return module.project(means, quats, scales, opacities, camera, near, absgrad, **options)
 
 
 def blend(
@@ -162,8 +166,7 @@ def sh_to_colors(
         raise ValueError(f"sh has {sh.shape[1]} coefficients per channel, degree {degree} needs {bases}")
     if visible is not None and visible.shape != means.shape[:1]:
         raise ValueError(f"visible has shape {list(visible.shape)}, expected [{len(means)}]")
-    module = _module("cpu" if backend == "cpu" else "reference")
-    return module.sh_to_colors(means, sh, camera, degree, visible)
+    return _module(backend).sh_to_colors(means, sh, camera, degree, visible)
 
 
 def rasterize(

@@ -96,7 +96,7 @@ def project(
         means2d=means.new_zeros(len(means), 2).index_put((index,), centres[kept]),
         depths=means.new_zeros(len(means)).index_put((index,), points[kept, 2]),
         conics=means.new_zeros(len(means), 3).index_put((index,), conics[kept]),
-        opacities=opacities,
+        opacities=opacities.clamp(max=1),
         radii=radii,
         backend="reference",
         tiles=None,
