@@ -73,13 +73,13 @@ def render(case: Case, backend: str, dtype: torch.dtype) -> tuple[Projection, Re
     if pulled:
         torch.autograd.backward(*map(list, zip(*pulled, strict=True)))
     names = ["means", "quats", "scales", "opacities", "colors"]
-    grads = {name: t.grad for name, t in zip(names, inputs, strict=True)}
-    grads |= {
-        "background": background.grad,
-        "means2d": projection.means2d.grad,
-        "absgrad": projection.absgrad,
-    }
-    return projection, rendering, {k: torch.zeros(()) if v is None else v.cpu() for k, v in grads.items()}
+    leaves = dict(zip(names, inputs, strict=True)) | {"background": background, "means2d": projection.means2d}
+    grads = {name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in leaves.items()}
+    return (
+        projection,
+        rendering,
+        {name: g.cpu() for name, g in (grads | {"absgrad": projection.absgrad}).items()},
+    )
 
 
 def assert_same(case: Case, backend: str, tolerance: float = 1e-4) -> None:
