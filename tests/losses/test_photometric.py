@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.losses.photometric import masked_photometric
+from wildgs.losses.photometric import masked_photometric, mismatch
 from wildgs.losses.ssim import _ssim_by_convolution, gaussian_taps, ssim
 
 
@@ -119,11 +119,41 @@ def test_hidden_pixels_cost_nothing_and_pull_nothing():
     assert render.grad[:, 12:].abs().max() == 0
 
 
-def test_gradient_reaches_mask_and_render():
+def test_gradient_to_the_render_is_the_formulas():
     photo, render = pictures(9, 8)
     visibility = torch.rand(9, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    render, visibility = (render + 0.3).requires_grad_(), visibility.requires_grad_()
-    assert torch.autograd.gradcheck(lambda r, m: masked_photometric(photo, r, m), (render, visibility))
+    render = (render + 0.3).requires_grad_()
+    assert torch.autograd.gradcheck(lambda r: masked_photometric(photo, r, visibility), (render,))
+
+
+def test_a_learning_mask_changes_neither_value_nor_the_renders_gradient():
+    photo, render = pictures(20, 14)
+    visibility = torch.rand(20, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    results = []
+    for mask in (visibility, visibility.clone().requires_grad_()):
+        leaf = render.clone().requires_grad_()
+        loss = masked_photometric(photo, leaf, mask)
+        loss.backward()
+        results.append((loss.detach(), leaf.grad))
+    torch.testing.assert_close(results[0], results[1])
+
+
+def test_mask_gradient_is_what_the_pixel_costs():
+    photo, render = pictures(20, 14)
+    visibility = torch.full((20, 14), 0.7, dtype=torch.float64, requires_grad=True)
+    masked_photometric(photo, render, visibility).backward()
+    torch.testing.assert_close(visibility.grad, mismatch(photo, render) / (20 * 14))
+    assert (visibility.grad >= 0).all(), "no pixel is worth more than hiding it"
+
+
+def test_mismatch_is_zero_for_equal_and_local_for_unlike_pictures():
+    photo, _ = pictures(40, 40)
+    assert mismatch(photo, photo).abs().max() < 1e-12
+    render = photo.clone()
+    render[:8, :8] = 1 - render[:8, :8]
+    cost = mismatch(photo, render)
+    assert cost[2:6, 2:6].mean() > 0.2
+    assert cost[26:, 26:].abs().max() < 1e-12
 
 
 def test_hiding_a_wrong_region_lowers_the_loss():
