@@ -1,0 +1,73 @@
+from pathlib import Path
+
+import pytest
+
+from wildgs.cli import depth, sfm
+from wildgs.cli import main as wildgs
+from wildgs.data.sfm_report import SfmReport
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sfm", "nowhere", "--output", "scene"], "nowhere: no such folder"),
+        (["depth", "nowhere"], "nowhere: no such folder"),
+    ],
+)
+def test_mistakes_end_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        wildgs(arguments)
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_and_report_are_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = SfmReport(
+        3, ("a.jpg", "b.jpg"), {"c [x].jpg": "matches no other photo"}, 9, 0.5, "gps", 3, (2,), 1.0
+    )
+
+    def reconstruct(photos: Path, output: Path, config: object, *, overwrite: bool, progress) -> SfmReport:
+        assert (photos, output, overwrite) == (Path("p"), Path("s"), True)
+        progress("reading photos", 1, 3)
+        progress("reading photos", 3, 3)
+        progress("undistorting", 0, 0)
+        return report
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    sfm.run(sfm.Command(Path("p"), Path("s"), overwrite=True))
+    printed = capsys.readouterr().out
+    assert "reading photos: 3 done" in printed
+    assert "2 of 3 photos registered" in printed
+    assert "c [x].jpg: matches no other photo" in printed
+
+
+def test_depth_reports_what_it_wrote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = {}
+
+    def load(source: str, **options: object) -> object:
+        asked.update(options, source=source)
+        return object()
+
+    def fill(root: Path, estimator: object, *, overwrite: bool, progress) -> tuple[int, int]:
+        progress(3, 3)
+        return 2, 1
+
+    monkeypatch.setattr(depth, "load_depth_anything", load)
+    monkeypatch.setattr(depth, "fill_depth_folder", fill)
+    depth.run(depth.Command(tmp_path, model="here", device="cpu"))
+    assert asked == {"source": "here", "device": "cpu", "required": True}
+    assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")
