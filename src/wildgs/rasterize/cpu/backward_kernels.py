@@ -20,7 +20,6 @@ from wildgs.rasterize.cpu.forward_kernels import (
     DEPTH,
     FIELDS,
     GREEN,
-    LANES,
     LEVEL,
     MAX_ALPHA,
     PIXELS,
@@ -32,9 +31,9 @@ from wildgs.rasterize.cpu.forward_kernels import (
     Y_PER_X,
     X,
     Y,
-    aligned,
     load_batch,
 )
+from wildgs.rasterize.cpu.picture_kernels import LANES, PATCH, aligned, load_block
 from wildgs.rasterize.cpu.reach_kernels import MIN_LEVEL, TILE, reach
 from wildgs.rasterize.cpu.simd import (
     fetch_add,
@@ -45,6 +44,7 @@ from wildgs.rasterize.cpu.simd import (
     lowest_bit,
     mask_bits,
     prefetch,
+    prefetch_to_write,
     select,
     splat,
     vexp2,
@@ -64,28 +64,19 @@ BEHIND, REACHED, V_ALPHA, V_DEPTH, V_COLORS = 16, 32, 48, 64, 80
 @njit(nogil=True, cache=True)
 def load_tile(
     tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth, out_alpha,
-    v_colors, v_depth, v_alpha, stride, v,
+    v_colors, v_depth, v_alpha, stride, patch, v,
 ):  # fmt: skip
     """Gathers a tile's state and incoming gradients by block (see the offsets at the top)."""
-    v[:] = 0.0
     for block in range(16):
-        for lane in range(LANES):
-            v[block * stride + lane] = final_transmittance[tile * PIXELS + block * LANES + lane]
-            v[block * stride + REACHED + lane] = last[tile * PIXELS + block * LANES + lane]
-    for row in range(min(TILE, height - ty * TILE)):
-        for column in range(min(TILE, width - tx * TILE)):
-            at = ((row >> 2) * 4 + (column >> 2)) * stride + (row & 3) * 4 + (column & 3)
-            pixel = (ty * TILE + row) * width + tx * TILE + column
-            total = v_alpha[pixel]
-            for k in range(channels):
-                v[at + V_COLORS + k * LANES] = v_colors[pixel * channels + k]
-                total -= v_colors[pixel * channels + k] * background[k]
-            alpha = out_alpha[pixel]
-            if with_depth and alpha > 0.0:
-                share = v_depth[pixel] / alpha
-                v[at + V_DEPTH] = share
-                total -= share * out_depth[pixel]
-            v[at + V_ALPHA] = total
+        x, y, at = tx * TILE + (block & 3) * 4, ty * TILE + (block >> 2) * 4, block * stride
+        vstore(v, at, vload(final_transmittance, tile * PIXELS + block * LANES))
+        vstore(v, at + BEHIND, splat(0.0))
+        vstore(v, at + REACHED, vload(last, tile * PIXELS + block * LANES))
+        if x < width and y < height:
+            load_block(
+                x, y, width, height, channels, with_depth, background, out_depth, out_alpha, v_colors, v_depth, v_alpha,
+                patch, v, at + V_ALPHA, at + V_DEPTH, at + V_COLORS,
+            )  # fmt: skip
 
 
 @njit(nogil=True, cache=True)
@@ -98,7 +89,7 @@ def blend_backward(
     stride = V_COLORS + channels * LANES
     v = aligned(16 * stride)
     v_color = aligned(channels * LANES)
-    batch = aligned(FIELDS * BATCH)
+    batch, patch = aligned(FIELDS * BATCH), aligned(PATCH)
     farthest = aligned(16)
     masks = np.empty(BATCH, np.int64)
     places = aligned(2 * PIXELS)
@@ -114,7 +105,7 @@ def blend_backward(
         begin = offsets[tile]
         load_tile(
             tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth, out_alpha,
-            v_colors, v_depth, v_alpha, stride, v,
+            v_colors, v_depth, v_alpha, stride, patch, v,
         )  # fmt: skip
         end = 0
         for block in range(16):
@@ -130,6 +121,7 @@ def blend_backward(
             first = begin + start
             load_batch(first, stop - start, ids, records, values, channels, tx, ty, batch)
             for i in range(stop - start):
+                prefetch_to_write(rows, slots[first + i] * row_size)
                 masks[i] = mask_bits(vload(farthest, 0) >= np.float32(start + i + 1)) & reach(
                     batch[X + i], batch[Y + i], np.float32(4.0), batch[QA + i], batch[QB + i], batch[QC + i],
                     batch[LEVEL + i], batch[Y_PER_X + i], batch[X_PER_Y + i],

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from wildgs.rasterize.cpu.picture_kernels import LANES, PATCH, aligned, close_tile, open_tile
 from wildgs.rasterize.cpu.reach_kernels import (
     HALF,
     MIN_LEVEL,
@@ -38,7 +39,6 @@ from wildgs.rasterize.cpu.simd import (
 )
 
 PIXELS = TILE * TILE
-LANES = 16
 # A tile's list is worked off in batches: all of a batch's Gaussians for one block,
 # whose sums stay in registers.
 BATCH = 64
@@ -47,30 +47,6 @@ X, Y, QA, QB, QC, LEVEL, Y_PER_X, X_PER_Y, DEPTH, RED, GREEN, BLUE = tuple(range
 FIELDS = 12
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
-
-
-@njit(nogil=True, cache=True)
-def aligned(size):
-    """A float32 array that starts at a cache line, so that no vector straddles two."""
-    raw = np.empty(size + 16, np.float32)
-    skip = (64 - raw.ctypes.data % 64) % 64 // 4
-    return raw[skip : skip + size]
-
-
-@njit(nogil=True, cache=True)
-def open_tile(tx, ty, width, height, stride, sums):
-    """Sums 0 and transmittance 1 inside the picture, -1 outside; returns the bits of blocks with pixels inside."""
-    alive = 0
-    sums[:] = 0.0
-    for block in range(16):
-        for lane in range(16):
-            x = tx * TILE + (block & 3) * 4 + (lane & 3)
-            y = ty * TILE + (block >> 2) * 4 + (lane >> 2)
-            inside = x < width and y < height
-            sums[block * stride + lane] = 1.0 if inside else -1.0
-            if inside:
-                alive |= 1 << block
-    return alive
 
 
 @njit(nogil=True, cache=True)
@@ -144,6 +120,7 @@ def blend_forward(
     stride = (channels + 3) * LANES
     sums = aligned(16 * stride)
     reached = aligned(PIXELS)
+    patch = aligned(PATCH)
     batch = aligned(FIELDS * BATCH)
     words = np.empty(16, np.int64)
     while True:
@@ -217,7 +194,7 @@ def blend_forward(
                 if mask_bits(before > 0.0) == 0:
                     alive &= ~(1 << block)
         close_tile(
-            tx, ty, width, height, channels, with_depth, background, stride, sums, out_colors, out_depth, out_alpha
+            tx, ty, width, height, channels, with_depth, background, stride, sums, patch, out_colors, out_depth, out_alpha
         )  # fmt: skip
         if last is not None:
             for block in range(16):
@@ -225,22 +202,3 @@ def blend_forward(
                 to = tile * PIXELS + block * LANES
                 vstore(final_transmittance, to, vmax(transmittance, -transmittance))
                 vstore(last, to, vload(reached, block * LANES))
-
-
-@njit(nogil=True, cache=True)
-def close_tile(
-    tx, ty, width, height, channels, with_depth, background, stride, sums, out_colors, out_depth, out_alpha
-):  # fmt: skip
-    """Writes a finished tile into the pictures, row by row."""
-    for row in range(min(TILE, height - ty * TILE)):
-        for column in range(min(TILE, width - tx * TILE)):
-            at = ((row >> 2) * 4 + (column >> 2)) * stride + (row & 3) * 4 + (column & 3)
-            pixel = (ty * TILE + row) * width + tx * TILE + column
-            transmittance = abs(sums[at])
-            for k in range(channels):
-                out_colors[pixel * channels + k] = sums[at + (k + 3) * LANES] + transmittance * background[k]
-            # Summed, not 1 - transmittance: what is faint would have few digits left.
-            alpha = min(sums[at + LANES], np.float32(1.0))
-            out_alpha[pixel] = alpha
-            if with_depth:
-                out_depth[pixel] = sums[at + 2 * LANES] / alpha if alpha > 0.0 else np.float32(0.0)

@@ -180,24 +180,29 @@ def vstore(typingctx, array, offset, value):
     return types.void(array, offset, value), codegen
 
 
-@intrinsic
-def prefetch(typingctx, array, offset):
-    """Asks for the cache line of a C-contiguous array's flat element `offset`; any offset is safe."""
-    if not (isinstance(array, types.Array) and array.layout == "C" and isinstance(offset, types.Integer)):
-        return None
+def _prefetcher(to_write: int) -> Any:
+    def typing(typingctx, array, offset):
+        if not (isinstance(array, types.Array) and array.layout == "C" and isinstance(offset, types.Integer)):
+            return None
 
-    def codegen(context, builder, sig, args):
-        offset = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
-        byte_pointer = ir.IntType(8).as_pointer()
-        int32 = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte_pointer, int32, int32, int32])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        hints = [ir.Constant(int32, number) for number in (0, 3, 1)]  # to read, keep in all caches, data
-        builder.call(function, [builder.bitcast(pointer, byte_pointer), *hints])
-        return context.get_dummy_value()
+        def codegen(context, builder, sig, args):
+            offset = context.cast(builder, args[1], sig.args[1], types.intp)
+            pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+            byte_pointer = ir.IntType(8).as_pointer()
+            int32 = ir.IntType(32)
+            kind = ir.FunctionType(ir.VoidType(), [byte_pointer, int32, int32, int32])
+            function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+            hints = [ir.Constant(int32, number) for number in (to_write, 3, 1)]  # keep in all caches, data
+            builder.call(function, [builder.bitcast(pointer, byte_pointer), *hints])
+            return context.get_dummy_value()
 
-    return types.void(array, offset), codegen
+        return types.void(array, offset), codegen
+
+    return intrinsic(typing)
+
+
+# Ask for the cache line of a C-contiguous array's flat element `offset`, to read or to write; any offset is safe.
+prefetch, prefetch_to_write = _prefetcher(0), _prefetcher(1)
 
 
 @intrinsic

@@ -14,8 +14,9 @@ import numpy as np
 from numba import njit
 
 from wildgs.rasterize.cpu.reach_kernels import RECORD, inside_bits, window_mask
-from wildgs.rasterize.cpu.simd import fetch_add, lowest_bit
+from wildgs.rasterize.cpu.simd import fetch_add, lowest_bit, prefetch, prefetch_to_write
 
+AHEAD = 16  # items between asking for what an item needs and using it
 DIGIT = 12  # bits per radix pass, so that the counts stay in the fastest cache
 
 
@@ -68,20 +69,29 @@ def move_home(
         if chunk >= chunks:
             break
         row = cursors[chunk]
-        for g in range(chunk * n // chunks, (chunk + 1) * n // chunks):
-            ranks[g] = -1
-            if tile_counts[g] > 0:
-                tile = boxes[4 * g + 1] * tiles_x + boxes[4 * g]
-                rank = row[tile]
-                row[tile] = rank + 1
-                ranks[g] = rank
-                homes[rank] = g
-                for k in range(RECORD):
-                    ranked_records[RECORD * rank + k] = records[RECORD * g + k]
-                spans[4 * rank] = np.int32(boxes[4 * g]) | (np.int32(boxes[4 * g + 1]) << 16)
-                spans[4 * rank + 1] = np.int32(boxes[4 * g + 2]) | (np.int32(boxes[4 * g + 3]) << 16)
-                spans[4 * rank + 2] = masks[g]
-                spans[4 * rank + 3] = tile_counts[g]
+        end = (chunk + 1) * n // chunks
+        for first in range(chunk * n // chunks, end, AHEAD):
+            # Ranks first, so that the places that they point to are on their way when they are written.
+            for g in range(first, min(first + AHEAD, end)):
+                ranks[g] = -1
+                if tile_counts[g] > 0:
+                    tile = boxes[4 * g + 1] * tiles_x + boxes[4 * g]
+                    rank = row[tile]
+                    row[tile] = rank + 1
+                    ranks[g] = rank
+                    prefetch_to_write(homes, rank)
+                    prefetch_to_write(spans, 4 * rank)
+                    prefetch_to_write(ranked_records, RECORD * rank)
+            for g in range(first, min(first + AHEAD, end)):
+                rank = ranks[g]
+                if rank >= 0:
+                    homes[rank] = g
+                    for k in range(RECORD):
+                        ranked_records[RECORD * rank + k] = records[RECORD * g + k]
+                    spans[4 * rank] = np.int32(boxes[4 * g]) | (np.int32(boxes[4 * g + 1]) << 16)
+                    spans[4 * rank + 1] = np.int32(boxes[4 * g + 2]) | (np.int32(boxes[4 * g + 3]) << 16)
+                    spans[4 * rank + 2] = masks[g]
+                    spans[4 * rank + 3] = tile_counts[g]
 
 
 @njit(nogil=True, cache=True)
@@ -154,6 +164,7 @@ def count_pairs(counter, order, spans, records, tiles_x, cursors):
         row = cursors[chunk]
         row[:] = 0
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
+            prefetch(spans, 4 * order[min(i + AHEAD, count - 1)])
             rank = order[i]
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
             bits = int(spans[4 * rank + 2])
@@ -184,6 +195,9 @@ def write_pairs(counter, order, spans, records, starts, tiles_x, cursors, ids, s
             break
         row = cursors[chunk]
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
+            soon = order[min(i + AHEAD, count - 1)]
+            prefetch(spans, 4 * soon)
+            prefetch(starts, soon)
             rank = order[i]
             slot = starts[rank]
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16

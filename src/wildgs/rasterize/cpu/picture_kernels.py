@@ -1,0 +1,138 @@
+"""Numba (njit) functions between pictures (row by row) and a tile's blocks of 4 x 4 pixels (one vector each)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from wildgs.rasterize.cpu.reach_kernels import TILE
+from wildgs.rasterize.cpu.simd import select, splat, vload, vload3, vmax, vmin, vstore, vstore3
+
+LANES = 16
+PATCH = 48  # floats that a block of three channels has
+
+
+@njit(nogil=True, cache=True)
+def aligned(size):
+    """A float32 array that starts at a cache line, so that no vector straddles two."""
+    raw = np.empty(size + 16, np.float32)
+    skip = (64 - raw.ctypes.data % 64) % 64 // 4
+    return raw[skip : skip + size]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def put_rows(patch, per_pixel, picture, x, y, width, height):
+    """Writes a block's pixels, row after row in `patch`, to the picture at (x, y), cut at its border."""
+    row, count = 4 * per_pixel, min(4, width - x) * per_pixel
+    for line in range(min(4, height - y)):
+        at = ((y + line) * width + x) * per_pixel
+        if count == 12:
+            for k in range(12):
+                picture[at + k] = patch[line * 12 + k]
+        else:
+            for k in range(count):
+                picture[at + k] = patch[line * row + k]
+
+
+@njit(nogil=True, cache=True, inline="always")
+def get_rows(patch, per_pixel, picture, x, y, width, height):
+    """Reads a block's pixels from the picture; 0 beyond its border."""
+    row, count = 4 * per_pixel, min(4, width - x) * per_pixel
+    if count < row or height - y < 4:
+        patch[:] = 0.0
+    for line in range(min(4, height - y)):
+        at = ((y + line) * width + x) * per_pixel
+        if count == 12:
+            for k in range(12):
+                patch[line * 12 + k] = picture[at + k]
+        else:
+            for k in range(count):
+                patch[line * row + k] = picture[at + k]
+
+
+@njit(nogil=True, cache=True)
+def open_tile(tx, ty, width, height, stride, sums):
+    """Sums 0 and transmittance 1 inside the picture, -1 outside; returns the bits of blocks with pixels inside."""
+    alive = 0
+    sums[:] = 0.0
+    for block in range(16):
+        x, y = tx * TILE + (block & 3) * 4, ty * TILE + (block >> 2) * 4
+        vstore(sums, block * stride, splat(1.0 if x < width and y < height else -1.0))
+        if x < width and y < height:
+            alive |= 1 << block
+            if x + 4 > width or y + 4 > height:
+                for lane in range(LANES):
+                    if x + (lane & 3) >= width or y + (lane >> 2) >= height:
+                        sums[block * stride + lane] = -1.0
+    return alive
+
+
+@njit(nogil=True, cache=True)
+def close_tile(
+    tx, ty, width, height, channels, with_depth, background, stride, sums, patch, out_colors, out_depth, out_alpha
+):  # fmt: skip
+    """Writes a finished tile's colours, expected depth and alpha into the pictures."""
+    for block in range(16):
+        x, y, at = tx * TILE + (block & 3) * 4, ty * TILE + (block >> 2) * 4, block * stride
+        if x >= width or y >= height:
+            continue
+        transmittance = vload(sums, at)
+        transmittance = vmax(transmittance, -transmittance)
+        # Summed, not 1 - transmittance: what is faint would have few digits left.
+        alpha = vmin(vload(sums, at + LANES), 1.0)
+        vstore(patch, 0, alpha)
+        put_rows(patch, 1, out_alpha, x, y, width, height)
+        if with_depth:
+            seen = alpha > 0.0
+            vstore(patch, 0, select(seen, vload(sums, at + 2 * LANES) / select(seen, alpha, 1.0), 0.0))
+            put_rows(patch, 1, out_depth, x, y, width, height)
+        if channels == 3:
+            red = vload(sums, at + 3 * LANES) + transmittance * background[0]
+            green = vload(sums, at + 4 * LANES) + transmittance * background[1]
+            blue = vload(sums, at + 5 * LANES) + transmittance * background[2]
+            vstore3(patch, 0, (red, green, blue))
+            put_rows(patch, 3, out_colors, x, y, width, height)
+        else:
+            for lane in range(LANES):
+                if x + (lane & 3) < width and y + (lane >> 2) < height:
+                    pixel = (y + (lane >> 2)) * width + x + (lane & 3)
+                    through = abs(sums[at + lane])
+                    for k in range(channels):
+                        value = sums[at + (k + 3) * LANES + lane] + through * background[k]
+                        out_colors[pixel * channels + k] = value
+
+
+@njit(nogil=True, cache=True)
+def load_block(
+    x, y, width, height, channels, with_depth, background, out_depth, out_alpha, v_colors, v_depth, v_alpha,
+    patch, v, to_alpha, to_depth, to_colors,
+):  # fmt: skip
+    """Reads a block's incoming gradients: of accumulated alpha, of the depth sum, and of the channels."""
+    get_rows(patch, 1, v_alpha, x, y, width, height)
+    total = vload(patch, 0)
+    if channels == 3:
+        get_rows(patch, 3, v_colors, x, y, width, height)
+        red, green, blue = vload3(patch, 0)
+        vstore(v, to_colors, red)
+        vstore(v, to_colors + LANES, green)
+        vstore(v, to_colors + 2 * LANES, blue)
+        total = total - red * background[0] - green * background[1] - blue * background[2]
+    else:
+        for k in range(channels):
+            for lane in range(LANES):
+                inside = x + (lane & 3) < width and y + (lane >> 2) < height
+                pixel = (y + (lane >> 2)) * width + x + (lane & 3)
+                v[to_colors + k * LANES + lane] = (
+                    v_colors[pixel * channels + k] if inside else np.float32(0.0)
+                )
+            total = total - vload(v, to_colors + k * LANES) * background[k]
+    if with_depth:
+        get_rows(patch, 1, out_alpha, x, y, width, height)
+        alpha = vload(patch, 0)
+        get_rows(patch, 1, v_depth, x, y, width, height)
+        share = vload(patch, 0)
+        share = select(alpha > 0.0, share / select(alpha > 0.0, alpha, 1.0), 0.0)
+        get_rows(patch, 1, out_depth, x, y, width, height)
+        vstore(v, to_depth, share)
+        total = total - share * vload(patch, 0)
+    vstore(v, to_alpha, total)
