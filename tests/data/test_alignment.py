@@ -100,8 +100,8 @@ def test_the_aligned_scene_does_not_depend_on_the_input_frame(seed: int, scale: 
 
     direct = align_world(cameras, points, depths(cameras, points))
     detour = align_world(moved_cameras, moved_points, depths(moved_cameras, moved_points))
-    # The centre from which the principal axes are taken is a median per axis, which turns a little with the
-    frame.torch.testing.assert_close(
+    # The centre from which the principal axes are taken is a median per axis, so it shifts a little with them.
+    torch.testing.assert_close(
         detour.apply_points(moved_points), direct.apply_points(points), rtol=0, atol=0.02
     )
 

@@ -146,13 +146,14 @@ def _load(source: str, *, local: bool) -> Any:
     if local:
         logging.disable_progress_bar()
     try:
-        model, info = DepthAnythingForDepthEstimation.from_pretrained(
+        loaded: Any = DepthAnythingForDepthEstimation.from_pretrained(
             source, local_files_only=local, output_loading_info=True
         )
     finally:
         logging.set_verbosity(verbosity)
         if shown:
             logging.enable_progress_bar()
+    model, info = loaded
     if info["missing_keys"]:
         raise ValueError(f"{len(info['missing_keys'])} weights are missing")
     return model

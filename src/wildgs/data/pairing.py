@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 PairingName = Literal["exhaustive", "gps", "retrieval"]
@@ -139,7 +139,8 @@ def near_pairs(
     places = EARTH_RADIUS * np.stack(
         [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
     )
-    distances, partners = cKDTree(places).query(places, k=min(neighbours + 1, len(photos)))
+    found = KDTree(places).query(places, k=min(neighbours + 1, len(photos)))
+    distances, partners = np.asarray(found[0]), np.asarray(found[1])
     pairs = set()
     for row, photo in enumerate(photos):
         for distance, partner in zip(distances[row], partners[row], strict=True):

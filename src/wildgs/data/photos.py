@@ -143,15 +143,15 @@ def _write_scene(work: Workplace, copies: Sequence[WorkingCopy], model: Any) -> 
     pycolmap.undistort_images(dense, kept, work.images, jpeg_quality=JPEG_QUALITY)
     pinhole = pycolmap.Reconstruction(dense / "sparse")
     for copy in copies:
-        image = find_registered(pinhole, copy)
-        if image is None:
+        image, original = find_registered(pinhole, copy), find_registered(model, copy)
+        if image is None or original is None:
             continue
         image.name = copy.scene_name
         target = work.scene / "images" / copy.scene_name
         target.parent.mkdir(parents=True, exist_ok=True)
         (dense / "images" / copy.work_name).rename(target)
         if copy.masked:
-            _write_mask(work, copy, find_registered(model, copy).camera)
+            _write_mask(work, copy, original.camera)
     (work.scene / "sparse" / "0").mkdir(parents=True)
     pinhole.write(work.scene / "sparse" / "0")
 

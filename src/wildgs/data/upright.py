@@ -177,7 +177,8 @@ def _save_jpeg(photo: Photo, original: Image.Image, target: Path) -> None:
     picture = Image.fromarray(photo.pixels)
     try:
         exif = original.getexif()
-        exif.get_ifd(EXIF_IFD), exif.get_ifd(GPS_IFD)  # read, or they would not be written again
+        for block in (EXIF_IFD, GPS_IFD):
+            exif.get_ifd(block)  # read, or it would not be written again
         exif[EXIF_ORIENTATION] = 1
         picture.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif.tobytes())
     except Exception:  # a broken EXIF block costs the focal length, not the photo
