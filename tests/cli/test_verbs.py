@@ -14,7 +14,16 @@ from PIL import Image
 
 from wildgs.cli import VERBS
 
-TRAIN = ("--steps", 40, "--wrapping.resolution", 16, "--parsing.max-side", 32, "--parsing.encoder", "nobody/none")
+TRAIN = (
+    "--steps",
+    40,
+    "--wrapping.resolution",
+    16,
+    "--parsing.max-side",
+    32,
+    "--parsing.encoder",
+    "nobody/none",
+)
 
 
 @pytest.fixture(scope="session")
@@ -52,9 +61,10 @@ def test_eval_writes_both_protocols(trained: Path, wildgs, landmark: Path) -> No
         assert metrics["mean"]["psnr"] > 5
         for image in metrics["images"]:
             stem = Path(image["name"]).stem
-            with Image.open(trained / "eval" / protocol / f"{stem}.png") as picture:
-                with Image.open(landmark / "images" / image["name"]) as photo:
-                    assert picture.size == photo.size
+            picture = Image.open(trained / "eval" / protocol / f"{stem}.png")
+            photo = Image.open(landmark / "images" / image["name"])
+            with picture, photo:
+                assert picture.size == photo.size
 
 
 def test_render_exchanges_light(trained: Path, wildgs, landmark: Path, tmp_path: Path) -> None:
@@ -88,7 +98,10 @@ MISTAKES = {
     "not a run": (("eval", "{tmp}"), "not a run folder"),
     "run exists": (("train", "{landmark}", "--output", "{trained}"), "already holds a run"),
     "nothing to resume": (("train", "{landmark}", "--output", "{tmp}/new", "--resume"), "config.yaml"),
-    "unknown photo": (("render", "{trained}", "--appearance", "x.jpg", "--output", "{tmp}/out"), "no photo 'x.jpg'"),
+    "unknown photo": (
+        ("render", "{trained}", "--appearance", "x.jpg", "--output", "{tmp}/o"),
+        "no photo 'x.jpg'",
+    ),
     "no photos": (("sfm", "{tmp}", "--output", "{tmp}/scene"), "no photo"),
     "bad downscale": (("train", "{landmark}", "--output", "{tmp}/run", "--downscale", "0"), "downscale"),
 }
@@ -136,7 +149,13 @@ def test_help_as_a_subprocess_is_instant_and_loads_no_torch() -> None:
 
 
 def test_mistake_as_a_subprocess(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from wildgs.cli import main; main()", "train", str(tmp_path / "no scene")]
+    command = [
+        sys.executable,
+        "-c",
+        "from wildgs.cli import main; main()",
+        "train",
+        str(tmp_path / "no scene"),
+    ]
     result = subprocess.run(
         [*command, "--output", str(tmp_path / "run")], capture_output=True, text=True, check=False
     )

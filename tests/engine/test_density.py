@@ -23,7 +23,9 @@ def method() -> VanillaGS:
     return method
 
 
-def controlled(method: VanillaGS, gradients: list[float], **config: float) -> tuple[DensityControl, Optimizers]:
+def controlled(
+    method: VanillaGS, gradients: list[float], **config: float
+) -> tuple[DensityControl, Optimizers]:
     optimizers = Optimizers.build(method, OptimizerConfig(), EXTENT)
     for parameter in method.gaussians.parameters():
         parameter.grad = torch.ones_like(parameter)

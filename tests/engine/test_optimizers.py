@@ -63,7 +63,9 @@ def test_reset_clears_one_row_only() -> None:
 
 
 @pytest.mark.parametrize(("progress", "expected"), [(0.0, 1.6e-4), (1.0, 1.6e-6), (0.5, 1.6e-5)])
-def test_position_rate_falls_exponentially_and_scales_with_the_scene(progress: float, expected: float) -> None:
+def test_position_rate_falls_exponentially_and_scales_with_the_scene(
+    progress: float, expected: float
+) -> None:
     _, optimizers = trained_baseline()
     optimizers.set_progress(progress)
     rates = {group["name"]: group["lr"] for group in optimizers.rows.param_groups}

@@ -21,7 +21,9 @@ from wildgs.model.wildgs import WildGSConfig
 pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
 
 
-def trainer_for(scene: Scene, model: WildGSConfig, steps: int, method: MethodName = "wildgs", **config) -> Trainer:
+def trainer_for(
+    scene: Scene, model: WildGSConfig, steps: int, method: MethodName = "wildgs", **config
+) -> Trainer:
     torch.manual_seed(0)
     made = create_method(method, model, scene.points, scene.point_colors)
     return Trainer(made, scene, TrainConfig(steps=steps, precision="float32", **config))
@@ -37,7 +39,9 @@ def test_loss_falls(wall_scene: Scene, tiny_model: WildGSConfig, method: MethodN
     assert sum(losses[-14:]) < 0.6 * sum(losses[:14])
 
 
-def test_wildgs_separates_lights_that_the_baseline_averages(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+def test_wildgs_separates_lights_that_the_baseline_averages(
+    wall_scene: Scene, tiny_model: WildGSConfig
+) -> None:
     errors = {}
     for method in ("wildgs", "3dgs"):
         trainer = trainer_for(wall_scene, tiny_model, 250, method)
@@ -79,7 +83,9 @@ def test_without_depth_there_is_no_depth_loss(wall_scene: Scene, tiny_model: Wil
 def test_resumed_run_ends_in_the_same_bits(
     wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path, method: MethodName
 ) -> None:
-    schedule = ScheduleConfig(densify_from=20 * 250, densify_every=10 * 250, reset_every=30 * 250, first_stage=2000)
+    schedule = ScheduleConfig(
+        densify_from=20 * 250, densify_every=10 * 250, reset_every=30 * 250, first_stage=2000
+    )
     whole = trainer_for(wall_scene, tiny_model, 120, method, schedule=schedule)
     whole.run([lambda r: save_checkpoint(tmp_path, r.step, whole.state(), {}) if r.step == 70 else None])
     checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
@@ -94,18 +100,24 @@ def test_resumed_run_ends_in_the_same_bits(
     assert different == []
 
 
-def test_a_scene_without_training_photos_is_a_users_mistake(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+def test_a_scene_without_training_photos_is_a_users_mistake(
+    wall_scene: Scene, tiny_model: WildGSConfig
+) -> None:
     with pytest.raises(UserError, match="no photo to train on"):
         trainer_for(replace(wall_scene, views=wall_scene.test_views), tiny_model, 10)
 
 
-def test_recorder_leaves_lines_and_a_board(wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path) -> None:
+def test_recorder_leaves_lines_and_a_board(
+    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path
+) -> None:
     trainer = trainer_for(wall_scene, tiny_model, 20)
     with Recorder(tmp_path, scalars_every=5, pictures_every=20) as recorder:
         trainer.run([recorder])
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10, 15, 20]
-    assert {"image", "mask", "depth", "total", "num_gaussians", "steps_per_second", "visibility"} <= set(lines[0])
+    assert {"image", "mask", "depth", "total", "num_gaussians", "steps_per_second", "visibility"} <= set(
+        lines[0]
+    )
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     board = EventAccumulator(str(tmp_path / "tensorboard"))
@@ -119,7 +131,7 @@ def test_checkpoints_keep_two_and_refuse_damage(tmp_path: Path) -> None:
         save_checkpoint(tmp_path, step, {"x": torch.full((4,), float(step))}, {"note": "ä"})
     kept = list_checkpoints(tmp_path)
     assert [path.name for path in kept] == ["step_00000002.safetensors", "step_00000003.safetensors"]
-    assert [path.name for path in sorted(tmp_path.iterdir())] == [path.name for path in kept], "nothing half written"
+    assert sorted(tmp_path.iterdir()) == kept, "nothing half written"
     checkpoint = load_checkpoint(kept[-1])
     assert checkpoint.header == {"note": "ä"}
     assert torch.equal(checkpoint.state["x"], torch.full((4,), 3.0))

@@ -160,7 +160,9 @@ def test_each_ablation_trains_and_lacks_what_it_says(camera, make_wall_model, pa
     if output.visibility is not None:
         loss = loss + output.visibility.mean()
     loss.backward()
-    gradients = {name for name, p in model.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+    gradients = {
+        name for name, p in model.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0
+    }
     trained = {
         "global": any(name.startswith("parsing.global_mlp") for name in gradients),
         "mask": "parsing.mask_head.bias" in gradients,
@@ -200,7 +202,9 @@ def test_baseline_ignores_the_photo(camera, wall) -> None:
 def test_empty_photo_encodes(camera, make_wall_model) -> None:
     """Nothing lifts from where the scene is not seen; the appearance is still finite."""
     model = make_wall_model()
-    away = camera.__class__(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), camera.K, camera.width, camera.height)
+    away = camera.__class__(
+        torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])), camera.K, camera.width, camera.height
+    )
     with torch.no_grad():
         sh = model.shade(model.encode(photo_of(camera), away))
     assert torch.isfinite(sh).all()

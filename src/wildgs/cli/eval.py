@@ -39,7 +39,7 @@ def run(command: Command) -> None:
     with counting("reading photos") as progress:
         scene = loaded.load_scene(progress)
     protocols: tuple[Protocol, ...] = ("full", "half") if command.protocol == "both" else (command.protocol,)
-    scores = {
+    scores: dict[Protocol, dict[str, Any]] = {
         protocol: evaluate_run(loaded, scene, protocol, lpips_folder=command.lpips) for protocol in protocols
     }
     print_scores({str(command.run): scores})

@@ -9,7 +9,6 @@ from torch.nn import functional
 
 from wildgs.losses.ssim import ssim, ssim_map
 
-
 EVIDENCE_SCALE = 2
 """The mask's evidence is gathered at half resolution: cheaper, and deaf to detail that is a pixel off."""
 

@@ -137,7 +137,7 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
             resnet = ResNetModel.from_pretrained(source, local_files_only=True)
         except (OSError, ValueError, RuntimeError) as error:
             raise UserError(f"{source} does not hold a ResNet-18 in the hub's layout: {error}") from error
-        if list(resnet.config.hidden_sizes) != list(FEATURE_WIDTHS[1:]):
+        if tuple(resnet.config.hidden_sizes or ()) != FEATURE_WIDTHS[1:]:
             raise UserError(f"{source} holds another network than ResNet-18; give the folder of {RESNET18}")
         return resnet
     for local in (True, False):

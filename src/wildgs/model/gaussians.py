@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
@@ -60,7 +60,9 @@ class Gaussians(nn.Module):
 
     def project(self, camera: Camera, *, absgrad: bool = False) -> Projection:
         """Projects and bins all Gaussians for one camera."""
-        return project(self.means, self.quats, self.scales, self.opacities, camera, near=NEAR, absgrad=absgrad)
+        return project(
+            self.means, self.quats, self.scales, self.opacities, camera, near=NEAR, absgrad=absgrad
+        )
 
 
 def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
@@ -75,7 +77,7 @@ def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
     """
     count = points.shape[0]
     neighbours = min(4, count)
-    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=neighbours, workers=-1)
+    distances, _ = KDTree(points.numpy()).query(points.numpy(), k=neighbours, workers=-1)
     nearest = torch.from_numpy(distances).reshape(count, neighbours)[:, 1:].float()
     spacing = (nearest.square().mean(dim=1)).sqrt() if neighbours > 1 else torch.ones(count)
     spacing = spacing.clamp(1e-4, max(float(spacing.median()) * 20, 1e-4))

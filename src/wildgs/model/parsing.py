@@ -58,7 +58,7 @@ class Parsing(MixedModule):
         )
         self.mask_head = nn.Conv2d(widths[-1], 1, 1)
         nn.init.zeros_(self.mask_head.weight)
-        nn.init.constant_(self.mask_head.bias, STATIC_BIAS)
+        self.mask_head.bias.data.fill_(STATIC_BIAS)  # pyright: ignore[reportOptionalMemberAccess]
 
     def forward(self, photo: Float[Tensor, "H W 3"]) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
         """Parses one photo.

@@ -21,7 +21,7 @@ class ConvBlock(nn.Module):
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
         for layer in (self.first, self.second):
             nn.init.kaiming_normal_(layer.weight, a=0.1, nonlinearity="leaky_relu")
-            nn.init.zeros_(layer.bias)
+            layer.bias.data.zero_()  # pyright: ignore[reportOptionalMemberAccess]
 
     def forward(self, x: Float[Tensor, "B I H W"]) -> Float[Tensor, "B O H W"]:
         """Features at the same resolution."""
