@@ -193,7 +193,7 @@ def sh_to_colors(
 def selective_adam(
     parameters: Iterable[Any], *, eps: float = 1e-15, betas: tuple[float, float] = (0.9, 0.999)
 ) -> torch.optim.Adam:
-    """gsplat's Adam that touches only the Gaussians that were seen (Taming 3DGS).
+    """Adam of gsplat that touches only the Gaussians that were seen (Taming 3DGS).
 
     Args:
         parameters: Groups of one CUDA tensor each, first axis over Gaussians, each with its `lr`.

@@ -33,26 +33,23 @@ from wildgs.rasterize.cpu.forward_kernels import (
     Y,
     load_batch,
 )
-from wildgs.rasterize.cpu.picture_kernels import LANES, PATCH, aligned, load_block
+from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, load_block
 from wildgs.rasterize.cpu.reach_kernels import MIN_LEVEL, TILE, reach
 from wildgs.rasterize.cpu.simd import (
-    fetch_add,
+    LANES,
     fma,
     lane_sums,
     lane_x,
     lane_y,
     lowest_bit,
     mask_bits,
-    prefetch,
-    prefetch_to_write,
     select,
     splat,
     vexp2,
-    vload,
     vmax,
     vmin,
-    vstore,
 )
+from wildgs.rasterize.cpu.simd_memory import fetch_add, prefetch, prefetch_to_write, vload, vstore
 
 # A pair's row: six moments, |d x|, |d y| (absgrad), depth, then colours; whole vectors.
 ROW_ABS, ROW_DEPTH, ROW_COLORS = 6, 8, 9

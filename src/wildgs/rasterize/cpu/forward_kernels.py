@@ -12,31 +12,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from wildgs.rasterize.cpu.picture_kernels import LANES, PATCH, aligned, close_tile, open_tile
-from wildgs.rasterize.cpu.reach_kernels import (
-    HALF,
-    MIN_LEVEL,
-    REACH,
-    RECORD,
-    TILE,
-    nearest_exponent,
-)
+from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, close_tile, open_tile
+from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, REACH, RECORD, TILE, nearest_exponent
 from wildgs.rasterize.cpu.simd import (
-    fetch_add,
+    LANES,
     fma,
     lane_x,
     lane_y,
     lowest_bit,
     mask_bits,
-    prefetch,
     select,
     splat,
     vexp2,
-    vload,
     vmax,
     vmin,
-    vstore,
 )
+from wildgs.rasterize.cpu.simd_memory import fetch_add, prefetch, vload, vstore
 
 PIXELS = TILE * TILE
 # A tile's list is worked off in batches: all of a batch's Gaussians for one block,

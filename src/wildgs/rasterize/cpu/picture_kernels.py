@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit
 
 from wildgs.rasterize.cpu.reach_kernels import TILE
-from wildgs.rasterize.cpu.simd import select, splat, vload, vload3, vmax, vmin, vstore, vstore3
+from wildgs.rasterize.cpu.simd import select, splat, vmax, vmin
+from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore3
 
 LANES = 16
 PATCH = 48  # floats that a block of three channels has

@@ -20,8 +20,8 @@ from numba.extending import intrinsic, models, register_model
 
 LANES = 16
 _FLOAT = ir.FloatType()
-_VECTOR = ir.VectorType(_FLOAT, LANES)
-_INT_VECTOR = ir.VectorType(ir.IntType(32), LANES)
+VECTOR_IR = ir.VectorType(_FLOAT, LANES)
+INT_VECTOR = ir.VectorType(ir.IntType(32), LANES)
 _MASK_VECTOR = ir.VectorType(ir.IntType(1), LANES)
 # NaN and infinity keep their meaning: culling depends on comparisons with them being false. Nothing is fused or
 # reordered behind the kernels' back (`fma` says where), so that a test gives the same answer wherever it is inlined.
@@ -45,7 +45,7 @@ MASK = _Mask()
 @register_model(_Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: types.Type) -> None:
-        super().__init__(dmm, fe_type, _VECTOR)
+        super().__init__(dmm, fe_type, VECTOR_IR)
 
 
 @register_model(_Mask)
@@ -55,9 +55,9 @@ class _MaskModel(models.PrimitiveModel):
 
 
 def _splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+    one = builder.insert_element(ir.Constant(VECTOR_IR, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(
-        one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(_INT_VECTOR, [0] * LANES)
+        one, ir.Constant(VECTOR_IR, ir.Undefined), ir.Constant(INT_VECTOR, [0] * LANES)
     )
 
 
@@ -68,7 +68,7 @@ def _as_vector(context: Any, builder: ir.IRBuilder, value: ir.Value, kind: types
 
 
 def _constant(numbers: list[float]) -> ir.Constant:
-    return ir.Constant(_VECTOR, numbers)
+    return ir.Constant(VECTOR_IR, numbers)
 
 
 def _is_operand(kind: types.Type) -> bool:
@@ -142,69 +142,6 @@ def _lower_invert(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> i
     return builder.not_(args[0])
 
 
-def _element_pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, offset: Any) -> ir.Value:
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.gep(data, [offset])
-
-
-def _flat_float_array(kind: types.Type) -> bool:
-    return isinstance(kind, types.Array) and kind.layout == "C" and kind.dtype == types.float32
-
-
-@intrinsic
-def vload(typingctx, array, offset):
-    """Sixteen floats from a C-contiguous float32 array, from flat element `offset` on."""
-    if not (_flat_float_array(array) and isinstance(offset, types.Integer)):
-        return None
-
-    def codegen(context, builder, sig, args):
-        offset = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
-        return builder.load(builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
-
-    return VECTOR(array, offset), codegen
-
-
-@intrinsic
-def vstore(typingctx, array, offset, value):
-    """Writes sixteen floats to a C-contiguous float32 array, from flat element `offset` on."""
-    if not (_flat_float_array(array) and isinstance(offset, types.Integer) and value is VECTOR):
-        return None
-
-    def codegen(context, builder, sig, args):
-        offset = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
-        builder.store(args[2], builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, offset, value), codegen
-
-
-def _prefetcher(to_write: int) -> Any:
-    def typing(typingctx, array, offset):
-        if not (isinstance(array, types.Array) and array.layout == "C" and isinstance(offset, types.Integer)):
-            return None
-
-        def codegen(context, builder, sig, args):
-            offset = context.cast(builder, args[1], sig.args[1], types.intp)
-            pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
-            byte_pointer = ir.IntType(8).as_pointer()
-            int32 = ir.IntType(32)
-            kind = ir.FunctionType(ir.VoidType(), [byte_pointer, int32, int32, int32])
-            function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-            hints = [ir.Constant(int32, number) for number in (to_write, 3, 1)]  # keep in all caches, data
-            builder.call(function, [builder.bitcast(pointer, byte_pointer), *hints])
-            return context.get_dummy_value()
-
-        return types.void(array, offset), codegen
-
-    return intrinsic(typing)
-
-
-# Ask for the cache line of a C-contiguous array's flat element `offset`, to read or to write; any offset is safe.
-prefetch, prefetch_to_write = _prefetcher(0), _prefetcher(1)
-
-
 @intrinsic
 def splat(typingctx, scalar):
     """The same number in every lane."""
@@ -263,7 +200,7 @@ vmax = intrinsic(_extremum(">"))
 
 
 def _call_vector_intrinsic(builder: ir.IRBuilder, name: str, *values: ir.Value) -> ir.Value:
-    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(values))
+    kind = ir.FunctionType(VECTOR_IR, [VECTOR_IR] * len(values))
     function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
     return builder.call(function, values)
 
@@ -316,18 +253,6 @@ def lowest_bit(typingctx, bits):
     return (types.int64(bits), codegen) if isinstance(bits, types.Integer) else None
 
 
-@intrinsic
-def fetch_add(typingctx, array, amount):
-    """Atomically adds to element 0 of an int64 array and returns what was there: hands out work to threads."""
-
-    def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        amount = context.cast(builder, args[1], sig.args[1], types.int64)
-        return builder.atomic_rmw("add", data, amount, "monotonic")
-
-    return types.int64(array, amount), codegen
-
-
 # exp2 on [-0.5, 0.5], minimax of degree 5, relative error 7.5e-8.
 _EXP2 = (1.32765e-3, 9.67554e-3, 5.550713e-2, 2.402212e-1, 6.9314697e-1, 1.00000007)
 
@@ -338,14 +263,14 @@ def vexp2(typingctx, value):
 
     def codegen(context, builder, sig, args):
         x = args[0]
-        whole = builder.fptosi(builder.fsub(x, _constant([0.5] * LANES)), _INT_VECTOR)
-        rest = builder.fsub(x, builder.sitofp(whole, _VECTOR))
+        whole = builder.fptosi(builder.fsub(x, _constant([0.5] * LANES)), INT_VECTOR)
+        rest = builder.fsub(x, builder.sitofp(whole, VECTOR_IR))
         power = _constant([_EXP2[0]] * LANES)
         for coefficient in _EXP2[1:]:
             power = _fused(builder, power, rest, _constant([coefficient] * LANES))
-        shift = ir.Constant(_INT_VECTOR, [23] * LANES)
-        bits = builder.add(builder.bitcast(power, _INT_VECTOR), builder.shl(whole, shift))
-        return builder.bitcast(bits, _VECTOR)
+        shift = ir.Constant(INT_VECTOR, [23] * LANES)
+        bits = builder.add(builder.bitcast(power, INT_VECTOR), builder.shl(whole, shift))
+        return builder.bitcast(bits, VECTOR_IR)
 
     return (VECTOR(value), codegen) if value is VECTOR else None
 
@@ -356,85 +281,25 @@ def vlog2(typingctx, value):
 
     def codegen(context, builder, sig, args):
         def ints(number):
-            return ir.Constant(_INT_VECTOR, [number] * LANES)
+            return ir.Constant(INT_VECTOR, [number] * LANES)
 
         def floats(number):
             return _constant([number] * LANES)
 
         # x = 2^whole * mantissa with the mantissa in [sqrt(1/2), sqrt(2)), then the series of atanh.
-        bits = builder.bitcast(args[0], _INT_VECTOR)
+        bits = builder.bitcast(args[0], INT_VECTOR)
         above = builder.sub(bits, ints(0x3F3504F3))
         whole = builder.ashr(above, ints(23))
-        mantissa = builder.bitcast(builder.sub(bits, builder.shl(whole, ints(23))), _VECTOR)
+        mantissa = builder.bitcast(builder.sub(bits, builder.shl(whole, ints(23))), VECTOR_IR)
         ratio = builder.fdiv(builder.fsub(mantissa, floats(1.0)), builder.fadd(mantissa, floats(1.0)))
         square = builder.fmul(ratio, ratio)
         series = floats(1.0 / 9.0)
         for odd in (7.0, 5.0, 3.0, 1.0):
             series = _fused(builder, series, square, floats(1.0 / odd))
         logarithm = builder.fmul(builder.fmul(series, ratio), floats(2.8853900817779268))
-        return builder.fadd(logarithm, builder.sitofp(whole, _VECTOR), flags=_FLAGS)
+        return builder.fadd(logarithm, builder.sitofp(whole, VECTOR_IR), flags=_FLAGS)
 
     return (VECTOR(value), codegen) if value is VECTOR else None
-
-
-def _columns_loader(count: int) -> Any:
-    def typing(typingctx, array, offset):
-        if not _flat_float_array(array):
-            return None
-        result = types.UniTuple(VECTOR, count)
-
-        def codegen(context, builder, sig, args):
-            offset = context.cast(builder, args[1], sig.args[1], types.intp)
-            base = _element_pointer(context, builder, sig.args[0], args[0], offset)
-            base = builder.bitcast(base, _VECTOR.as_pointer())
-            steps = [ir.Constant(ir.IntType(64), i) for i in range(count)]
-            vectors = [builder.load(builder.gep(base, [step]), align=4) for step in steps]
-            columns = [
-                _pick(builder, vectors, [lane * count + c for lane in range(LANES)]) for c in range(count)
-            ]
-            return context.make_tuple(builder, result, columns)
-
-        return result(array, offset), codegen
-
-    return intrinsic(typing)
-
-
-def _columns_storer(count: int) -> Any:
-    def typing(typingctx, array, offset, columns):
-        if not (_flat_float_array(array) and columns == types.UniTuple(VECTOR, count)):
-            return None
-
-        def codegen(context, builder, sig, args):
-            offset = context.cast(builder, args[1], sig.args[1], types.intp)
-            base = _element_pointer(context, builder, sig.args[0], args[0], offset)
-            base = builder.bitcast(base, _VECTOR.as_pointer())
-            columns = [builder.extract_value(args[2], i) for i in range(count)]
-            for i in range(count):
-                flat = [i * LANES + lane for lane in range(LANES)]
-                vector = _pick(builder, columns, [(f % count) * LANES + f // count for f in flat])
-                builder.store(vector, builder.gep(base, [ir.Constant(ir.IntType(64), i)]), align=4)
-            return context.get_dummy_value()
-
-        return types.void(array, offset, columns), codegen
-
-    return intrinsic(typing)
-
-
-def _pick(builder: ir.IRBuilder, vectors: list[ir.Value], sources: list[int]) -> ir.Value:
-    """A vector whose lanes come from the concatenation of several; one two-source shuffle for each but the first."""
-    result = vectors[0]
-    for i in range(1, len(vectors)):
-        numbers = []
-        for lane, source in enumerate(sources):
-            here = LANES + source % LANES if source // LANES == i else lane
-            numbers.append(source % LANES if i == 1 and source < LANES else here)
-        result = builder.shuffle_vector(result, vectors[i], ir.Constant(_INT_VECTOR, numbers))
-    return result
-
-
-# Rows of 2, 3, 4 or 8 floats, sixteen rows at once, as one vector per column: from (to) flat element `offset` on.
-vload2, vload3, vload4 = _columns_loader(2), _columns_loader(3), _columns_loader(4)
-vstore2, vstore3, vstore4, vstore8 = (_columns_storer(count) for count in (2, 3, 4, 8))
 
 
 @intrinsic
@@ -472,6 +337,6 @@ def _fold(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, half: int) -> ir.Valu
         source = (group // 2) * 2 * half + lane + (LANES if group % 2 else 0)
         low.append(source)
         high.append(source + half)
-    masks = [ir.Constant(_INT_VECTOR, numbers) for numbers in (low, high)]
+    masks = [ir.Constant(INT_VECTOR, numbers) for numbers in (low, high)]
     first, second = (builder.shuffle_vector(a, b, mask) for mask in masks)
     return builder.fadd(first, second, flags=_FLAGS)

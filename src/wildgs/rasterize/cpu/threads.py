@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from wildgs.errors import UserError
 
@@ -68,6 +69,18 @@ def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = Non
     kernel(counter, *arguments)
     for job in pending:
         job.result()
+
+
+def run_once(kernel: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a kernel on the calling thread alone; what is short is not worth sharing out."""
+    if getattr(kernel, "signatures", True):
+        return kernel(*arguments)
+    return announce_compilation(kernel, *arguments)
+
+
+def flat(tensor: Tensor) -> np.ndarray:
+    """A tensor's numbers as kernels take them: one axis, contiguous, no gradient."""
+    return tensor.detach().contiguous().numpy().reshape(-1)
 
 
 def announce_compilation(kernel: Callable[..., Any], *arguments: Any) -> Any:

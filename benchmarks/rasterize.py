@@ -1,0 +1,258 @@
+"""How fast is the rasteriser, and how far from what the machine can do?
+
+    python benchmarks/rasterize.py                 the table: N in 10k, 100k, 1M at three sizes
+    python benchmarks/rasterize.py --quick         100k at 640 x 480 alone
+    python benchmarks/rasterize.py --json          the rows, and nothing else, on stdout
+
+The scene: half of the Gaussians on a facade at depth 4, the rest uniform between depths 2 and 6, log-normal scales
+around 0.01, opacities uniform in [0, 1], focal length 0.9 widths. A run blends three channels and depth. Forward
+includes projection, binning and sorting; backward reaches means, quaternions, scales, opacities and colours. The times
+are medians of at least 7 runs after warm-up; the shortest are given beside them, as they suffer less from other
+programs.
+
+The share of peak compares the blend's exponentials and multiply-adds with those of a kernel that does nothing else,
+timed between the runs on as many threads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from statistics import median
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from wildgs.geometry.camera import Camera
+from wildgs.rasterize import BackendName, Projection, blend, project
+from wildgs.rasterize.cpu.reach_kernels import HALF, RECORD, count_bits, reach
+from wildgs.rasterize.cpu.simd import fma, splat, vexp2
+from wildgs.rasterize.cpu.simd_memory import fetch_add, vstore
+from wildgs.rasterize.cpu.threads import launch, thread_count
+
+SIZES = ((320, 240), (640, 480), (1280, 960))
+COUNTS = (10_000, 100_000, 1_000_000)
+REFERENCE_LIMIT = 1e9  # (Gaussian, pixel) pairs that the dense reference is asked for
+# Multiply-adds beside the exponential that one block of 16 pixels needs, forward and backward.
+BLEND_FMAS = {"forward": 14, "backward": 36}
+PEAK_ROUNDS, PEAK_EXPONENTIALS, PEAK_FMAS = 20_000, 4, 56
+
+
+@dataclass
+class Row:
+    """One line of the table; rates count pixels that the kernel computes, in blocks of 16."""
+
+    backend: str
+    n: int
+    width: int
+    height: int
+    threads: int
+    forward_ms: float
+    backward_ms: float
+    forward_min_ms: float
+    backward_min_ms: float
+    tile_pairs: int | None = None
+    pixel_gaussians: int | None = None
+    forward_per_second: float | None = None
+    backward_per_second: float | None = None
+    share_of_peak_forward: float | None = None
+    share_of_peak_backward: float | None = None
+    times_faster_than_reference: float | None = None
+
+
+def make_scene(n: int, width: int, height: int, seed: int = 0) -> tuple[list[Tensor], Camera]:
+    """Means, quaternions, scales, opacities and colours, and the camera."""
+    g = torch.Generator().manual_seed(seed)
+    focal = 0.9 * width
+    depth = torch.where(torch.arange(n) % 2 == 0, 4.0, 2 + 4 * torch.rand(n, generator=g))
+    x = (torch.rand(n, generator=g) - 0.5) * width / focal * depth
+    y = (torch.rand(n, generator=g) - 0.5) * height / focal * depth
+    scales = torch.exp(math.log(0.01) + 0.5 * torch.randn(n, 3, generator=g))
+    quats = torch.randn(n, 4, generator=g)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    inputs = [
+        torch.stack([x, y, depth], 1),
+        quats,
+        scales,
+        torch.rand(n, generator=g),
+        torch.rand(n, 3, generator=g),
+    ]
+    return inputs, Camera(torch.eye(4), K, width, height)
+
+
+@njit(nogil=True, cache=True)
+def peak_kernel(counter, chunks, out):
+    """Exponentials and multiply-adds in the blend's proportion with nothing to wait for."""
+    while True:
+        chunk = fetch_add(counter, 1)
+        if chunk >= chunks:
+            break
+        a, b, c, d = splat(-0.1), splat(-0.2), splat(-0.3), splat(-0.4)
+        e, f, g, h = splat(0.1), splat(0.2), splat(0.3), splat(0.4)
+        for _ in range(PEAK_ROUNDS):
+            for _ in range(PEAK_FMAS // 8):
+                a, b, c, d = fma(a, 0.5, -0.1), fma(b, 0.5, -0.1), fma(c, 0.5, -0.1), fma(d, 0.5, -0.1)
+                e, f, g, h = fma(e, 0.5, 0.1), fma(f, 0.5, 0.1), fma(g, 0.5, 0.1), fma(h, 0.5, 0.1)
+            e, f, g, h = e + vexp2(a), f + vexp2(b), g + vexp2(c), h + vexp2(d)
+        vstore(out, chunk * 16, a + b + c + d + e + f + g + h)
+
+
+def peak_seconds_per_block(fmas: int) -> float:
+    """What one exponential and `fmas` multiply-adds of sixteen pixels take on all threads at their best."""
+    chunks = 4 * thread_count()
+    out = np.empty(16 * chunks, np.float32)
+    seconds = min(timed(lambda: launch(peak_kernel, chunks, out)) for _ in range(7))
+    per_block = seconds / (chunks * PEAK_ROUNDS * PEAK_EXPONENTIALS)
+    # The kernel has 14 multiply-adds per exponential; an exponential is worth about 12.
+    return per_block * (fmas + 12) / (PEAK_FMAS / PEAK_EXPONENTIALS + 12)
+
+
+@njit(nogil=True, cache=True)
+def count_blocks(offsets, ids, records, tiles_x):
+    """Blocks of 16 pixels that Gaussians reach."""
+    total = 0
+    for tile in range(offsets.size - 1):
+        x = np.float32(tile % tiles_x * 16) + HALF
+        y = np.float32(tile // tiles_x * 16) + HALF
+        for p in range(offsets[tile], offsets[tile + 1]):
+            r = ids[p] * RECORD
+            total += count_bits(
+                reach(
+                    x - records[r], y - records[r + 1], np.float32(4.0), records[r + 2], records[r + 3],
+                    records[r + 4], records[r + 5], records[r + 6], records[r + 7],
+                )
+            )  # fmt: skip
+    return total
+
+
+def timed(call: Callable[[], object]) -> float:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    start = time.perf_counter()
+    call()
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def measure(backend: BackendName, n: int, width: int, height: int, runs: int) -> Row:
+    """Times one combination; see the module's words."""
+    inputs, camera = make_scene(n, width, height)
+    if backend == "cuda":
+        inputs, camera = [t.cuda() for t in inputs], camera.to("cuda")
+    leaves = [t.requires_grad_() for t in inputs]
+    found: dict[str, Projection] = {}
+    pictures: list[Tensor] = []
+
+    def forward() -> None:
+        found["projection"] = project(*leaves[:4], camera, backend=backend)
+        rendering = blend(found["projection"], leaves[4])
+        pictures[:] = [rendering.colors, rendering.depth, rendering.alpha]
+
+    forward_times, backward_times = [], []
+    for run in range(runs + 2):
+        seconds = timed(forward)
+        pulls = [torch.rand_like(p) for p in pictures]
+        for leaf in leaves:
+            leaf.grad = None
+        pull_back = timed(lambda pulls=pulls: torch.autograd.backward(pictures, pulls))
+        if run >= 2:
+            forward_times.append(1e3 * seconds)
+            backward_times.append(1e3 * pull_back)
+    row = Row(
+        backend, n, width, height, thread_count(),
+        median(forward_times), median(backward_times), min(forward_times), min(backward_times),
+    )  # fmt: skip
+    if backend == "cpu":
+        add_rates(row, found["projection"])
+    return row
+
+
+def add_rates(row: Row, projection: Projection) -> None:
+    """What the CPU kernels did, and how that compares with the machine's peak."""
+    tiles = projection.tiles
+    blocks = count_blocks(tiles.offsets, tiles.ids, tiles.records, -(-row.width // 16))
+    row.tile_pairs, row.pixel_gaussians = int(tiles.ids.size), 16 * blocks
+    row.forward_per_second = row.pixel_gaussians / row.forward_ms * 1e3
+    row.backward_per_second = row.pixel_gaussians / row.backward_ms * 1e3
+    row.share_of_peak_forward = (
+        1e3 * blocks * peak_seconds_per_block(BLEND_FMAS["forward"]) / row.forward_min_ms
+    )
+    row.share_of_peak_backward = (
+        1e3 * blocks * peak_seconds_per_block(BLEND_FMAS["backward"]) / row.backward_min_ms
+    )
+
+
+def reference_ms(n: int, width: int, height: int) -> float | None:
+    """Forward and backward of the dense torch reference, one run; None where it would take minutes."""
+    if n * width * height > REFERENCE_LIMIT:
+        return None
+    row = measure("reference", n, width, height, runs=1)
+    return row.forward_ms + row.backward_ms
+
+
+def table(rows: list[Row]) -> str:
+    head = (
+        "| backend | N | size | forward ms (min) | backward ms (min) | tile pairs | G pixel-Gaussians/s fwd, bwd |"
+        " share of peak fwd, bwd | x reference |"
+    )
+    lines = [head, "|" + "---|" * 9]
+    for r in rows:
+        rates = shares = ratio = "-"
+        if r.forward_per_second and r.backward_per_second:
+            rates = f"{r.forward_per_second / 1e9:.2f}, {r.backward_per_second / 1e9:.2f}"
+            shares = f"{r.share_of_peak_forward:.0%}, {r.share_of_peak_backward:.0%}"
+        if r.times_faster_than_reference:
+            ratio = f"{r.times_faster_than_reference:.0f}"
+        lines.append(
+            f"| {r.backend} | {r.n} | {r.width}x{r.height} | {r.forward_ms:.1f} ({r.forward_min_ms:.1f}) |"
+            f" {r.backward_ms:.1f} ({r.backward_min_ms:.1f}) | {r.tile_pairs or '-'} | {rates} | {shares} | {ratio} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--n", type=int, nargs="+", default=list(COUNTS), help="numbers of Gaussians")
+    parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES], help="such as 640x480")
+    parser.add_argument(
+        "--backends", nargs="+", default=None, help="cpu, cuda; those that work here if not given"
+    )
+    parser.add_argument("--runs", type=int, default=9, help="runs after warm-up, at least 7")
+    parser.add_argument("--quick", action="store_true", help="100k at 640x480 alone")
+    parser.add_argument(
+        "--reference", action="store_true", help="time the dense reference too, where feasible"
+    )
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON and nothing else")
+    options = parser.parse_args()
+    counts, sizes = options.n, [tuple(int(v) for v in size.split("x")) for size in options.sizes]
+    if options.quick:
+        counts, sizes = [100_000], [(640, 480)]
+    backends = options.backends or (["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
+    rows = []
+    for backend in backends:
+        for n in counts:
+            for width, height in sizes:
+                row = measure(backend, n, width, height, max(7, options.runs))
+                dense = reference_ms(n, width, height) if options.reference else None
+                if dense is not None:
+                    row.times_faster_than_reference = dense / (row.forward_ms + row.backward_ms)
+                print(
+                    f"{backend} {n} {width}x{height}: {row.forward_ms:.1f} + {row.backward_ms:.1f} ms",
+                    file=sys.stderr,
+                )
+                rows.append(row)
+    print(json.dumps([asdict(row) for row in rows], indent=1) if options.json else table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Numba (njit) kernels of the projection, sixteen Gaussians at a time, and the tiles that they reach.
+
+Arrays are C-contiguous float32 and indexed flat. N must be at least 16: the last group overlaps the one before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from wildgs.rasterize.cpu.footprint_kernels import (
+    CHUNK,
+    DILATION,
+    GROUP,
+    LOG2_E,
+    MIN_ALPHA,
+    camera_numbers,
+    footprint,
+)
+from wildgs.rasterize.cpu.reach_kernels import (
+    MIN_LEVEL,
+    REACH,
+    RECORD,
+    count_bits,
+    inside_bits,
+    nearest_exponent,
+    window_mask,
+)
+from wildgs.rasterize.cpu.simd import (
+    mask_bits,
+    select,
+    splat,
+    vfloor,
+    vlog2,
+    vmax,
+    vmin,
+    vsqrt,
+)
+from wildgs.rasterize.cpu.simd_memory import (
+    fetch_add,
+    vload,
+    vload3,
+    vstore,
+    vstore2,
+    vstore3,
+    vstore8,
+)
+
+
+@njit(nogil=True, cache=True)
+def project_forward(
+    counter, means, quats, scales, opacities, view, lens, width, height, near,
+    means2d, depths, conics, radii, records, boxes, masks, tile_counts,
+):  # fmt: skip
+    """Projects all Gaussians: centres, depths, conics, radii, blending records and the tiles that they reach.
+
+    A Gaussian's tiles lie in its box (first and last tile, inclusive); where the box is at most 4 x 4 tiles, its
+    mask has a bit per tile that is reached, else it is -1.
+    """
+    n = depths.size
+    groups = (n + GROUP - 1) // GROUP
+    spans = np.empty(7 * GROUP, np.float32)
+    while True:
+        first = fetch_add(counter, 1) * CHUNK
+        if first >= groups:
+            break
+        for group in range(first, min(first + CHUNK, groups)):
+            i = min(group * GROUP, n - GROUP)
+            corners = project_group(
+                i, means, quats, scales, opacities, view, lens, width, height, near,
+                means2d, depths, conics, records, spans,
+            )  # fmt: skip
+            for lane in range(GROUP):
+                g = i + lane
+                radii[g] = np.int32(spans[lane])
+                tile_counts[g] = 0
+                if radii[g] > 0:
+                    tile_counts[g] = find_tiles(g, lane, spans, corners, records, boxes, masks)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def find_tiles(g, lane, spans, corners, records, boxes, masks):
+    """Writes a Gaussian's box and mask; returns how many tiles it reaches."""
+    x0, y0 = int(spans[GROUP + lane]), int(spans[2 * GROUP + lane])
+    x1, y1 = int(spans[3 * GROUP + lane]), int(spans[4 * GROUP + lane])
+    boxes[4 * g], boxes[4 * g + 1], boxes[4 * g + 2], boxes[4 * g + 3] = x0, y0, x1, y1
+    if x1 - x0 < 2 and y1 - y0 < 2:
+        nn, fn = (corners[0] >> lane) & 1, (corners[1] >> lane) & 1
+        nf, ff = (corners[2] >> lane) & 1, (corners[3] >> lane) & 1
+        masks[g] = nn | (fn << 1) | (nf << 4) | (ff << 5)
+        return nn + fn + nf + ff
+    if x1 - x0 < 4 and y1 - y0 < 4:
+        mask = window_mask(g, records, x0, y0) & inside_bits(x0, y0, x1, y1)
+        masks[g] = mask
+        return count_bits(mask)
+    masks[g] = -1
+    count = 0
+    for ty in range(y0, y1 + 1, 4):
+        for tx in range(x0, x1 + 1, 4):
+            count += count_bits(window_mask(g, records, tx, ty) & inside_bits(tx, ty, x1, y1))
+    return count
+
+
+@njit(nogil=True, cache=True)
+def project_group(
+    i, means, quats, scales, opacities, view, lens, width, height, near, means2d, depths, conics, records, spans
+):  # fmt: skip
+    """Sixteen Gaussians from index i.
+
+    `spans` takes radii and the boxes' first and last tiles. Returns, for the box's first tile, the one to its right,
+    the one below and the one beyond both, a bit per Gaussian that reaches it.
+    """
+    R = camera_numbers(view)
+    px, py, pz = vload3(means, 3 * i)
+    x = R[0] * px + R[1] * py + R[2] * pz + view[3]
+    y = R[3] * px + R[4] * py + R[5] * pz + view[7]
+    z = R[6] * px + R[7] * py + R[8] * pz + view[11]
+    in_front = z > near
+    iz = 1.0 / select(in_front, z, 1.0)
+
+    u, _, _ = footprint(i, quats, scales, R, lens, width, height, x, y, z, iz)
+    a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + DILATION
+    b = u[0] * u[3] + u[1] * u[4] + u[2] * u[5]
+    c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + DILATION
+    determinant = a * c - b * b
+    opacity = vload(opacities, i)
+    mx, my = lens[0] * x * iz + lens[2], lens[1] * y * iz + lens[3]
+
+    # NaN fails every comparison, and infinity the upper bounds: what is not finite is culled here.
+    sound = in_front & (z < 1e9) & (determinant > 0.0) & (determinant < 1e30) & (a < 1e15) & (c < 1e15)
+    sound = sound & (opacity >= MIN_ALPHA) & (opacity < 1e6)
+    level = vlog2(vmin(select(sound, opacity, 1.0), 1.0))
+    reached = vmax(2.0 / LOG2_E * (level - MIN_LEVEL), 0.0)
+    hx, hy = vsqrt(reached * a), vsqrt(reached * c)
+    seen = sound & (mx + hx > 0.0) & (mx - hx < width) & (my + hy > 0.0) & (my - hy < height)
+
+    zero = splat(0.0)
+    scale = 1.0 / select(sound, determinant, 1.0)
+    conic_a, conic_b, conic_c = c * scale, -b * scale, a * scale
+    vstore(depths, i, select(seen, z, zero))
+    vstore2(means2d, 2 * i, (select(seen, mx, zero), select(seen, my, zero)))
+    vstore3(
+        conics,
+        3 * i,
+        (
+            select(seen, conic_a, zero),
+            select(seen, conic_b, zero),
+            select(seen, conic_c, zero),
+        ),
+    )
+    radius = vmin(-vfloor(-vmax(hx, hy)), 1e9)
+    vstore(spans, 0, select(seen, vmax(radius, 1.0), zero))
+    if mask_bits(seen) == 0:
+        return 0, 0, 0, 0
+    A, B, C = -0.5 * LOG2_E * conic_a, -LOG2_E * conic_b, -0.5 * LOG2_E * conic_c
+    y_per_x, x_per_y = b / a, b / c
+    vstore8(records, RECORD * i, (mx, my, A, B, C, level, y_per_x, x_per_y))
+
+    # Pixels whose centres lie in the ellipse's box, then their tiles; there may be no such pixel.
+    left, top = -vfloor(-vmax(mx - hx - 0.5, 0.0)), -vfloor(-vmax(my - hy - 0.5, 0.0))
+    right, bottom = (
+        vfloor(vmin(mx + hx - 0.5, width - 1.0)),
+        vfloor(vmin(my + hy - 0.5, height - 1.0)),
+    )
+    seen = seen & (left <= right) & (top <= bottom)
+    x0, y0 = (
+        vfloor(select(seen, left, zero) * 0.0625),
+        vfloor(select(seen, top, zero) * 0.0625),
+    )
+    x1, y1 = (
+        vfloor(select(seen, right, zero) * 0.0625),
+        vfloor(select(seen, bottom, zero) * 0.0625),
+    )
+    vstore(spans, GROUP, x0)
+    vstore(spans, 2 * GROUP, y0)
+    vstore(spans, 3 * GROUP, x1)
+    vstore(spans, 4 * GROUP, y1)
+    left, top = x0 * 16.0 + 0.5 - mx, y0 * 16.0 + 0.5 - my
+    floor = REACH - level
+    near_x, near_y, far_x, far_y = left + 15.0, top + 15.0, left + 31.0, top + 31.0
+    nn = nearest_exponent(left, top, near_x, near_y, A, B, C, y_per_x, x_per_y)
+    fn = nearest_exponent(left + 16.0, top, far_x, near_y, A, B, C, y_per_x, x_per_y)
+    nf = nearest_exponent(left, top + 16.0, near_x, far_y, A, B, C, y_per_x, x_per_y)
+    ff = nearest_exponent(left + 16.0, top + 16.0, far_x, far_y, A, B, C, y_per_x, x_per_y)
+    wide, tall = seen & (x1 > x0), seen & (y1 > y0)
+    return (
+        mask_bits(seen & (nn >= floor)),
+        mask_bits(wide & (fn >= floor)),
+        mask_bits(tall & (nf >= floor)),
+        mask_bits(wide & tall & (ff >= floor)),
+    )

@@ -1,0 +1,223 @@
+"""Projection on the CPU: torch tensors in and out, kernels inside, the gradient by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wildgs.geometry.camera import Camera
+from wildgs.rasterize.cpu import project_backward_kernels, project_kernels, tile_kernels
+from wildgs.rasterize.cpu.reach_kernels import RECORD, TILE
+from wildgs.rasterize.cpu.scratch import scratch
+from wildgs.rasterize.cpu.threads import flat, launch, run_once, thread_count
+from wildgs.rasterize.interface import Projection
+
+GROUP = project_kernels.GROUP
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """What blending needs to know of the geometry; arrays are flat.
+
+    Gaussians that reach the picture are numbered by rank, so that neighbours in the picture are neighbours in memory.
+
+    Attributes:
+        ranks: Each Gaussian's rank; -1 where it reaches no tile.
+        homes: Each rank's Gaussian.
+        records: Per rank what blending reads, eight floats (see `reach_kernels.RECORD`).
+        starts: First slot of each rank's (tile, Gaussian) pairs, and the number of pairs.
+        offsets: Where each tile's list starts in `ids`; one more than there are tiles.
+        ids: Ranks, tile by tile, nearest first.
+        slots: Of each entry of `ids`: its slot among the rank's pairs.
+        tile_order: Tiles with long lists first, so that threads end together.
+    """
+
+    ranks: np.ndarray
+    homes: np.ndarray
+    records: np.ndarray
+    starts: np.ndarray
+    offsets: np.ndarray
+    ids: np.ndarray
+    slots: np.ndarray
+    tile_order: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera as the kernels take it."""
+
+    view: np.ndarray
+    lens: np.ndarray
+    width: int
+    height: int
+
+    @staticmethod
+    def of(camera: Camera) -> _Lens:
+        K = camera.K.detach().to("cpu", torch.float32)
+        view = camera.viewmat.detach().to("cpu", torch.float32)[:3].contiguous().numpy().reshape(-1)
+        lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
+        return _Lens(view, lens, camera.width, camera.height)
+
+    def arguments(self) -> tuple[Any, ...]:
+        return self.view, self.lens, np.float32(self.width), np.float32(self.height)
+
+
+def _padded(tensor: Tensor) -> Tensor:
+    """At least sixteen rows, which the vector kernels need; the rows added are zero and hence culled."""
+    missing = GROUP - len(tensor)
+    return tensor if missing <= 0 else torch.cat([tensor, tensor.new_zeros(missing, *tensor.shape[1:])])
+
+
+def _first(tensor: Tensor, n: int) -> Tensor:
+    """Undoes `_padded`; the tensor itself where nothing was added, as slicing costs a copy in the backward pass."""
+    return tensor if len(tensor) == n else tensor[:n]
+
+
+class _Project(torch.autograd.Function):
+    """Hands out what the projection kernel wrote; its backward pass is `project_backward`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        lens: _Lens,
+        outputs: Any,
+    ) -> Any:
+        means2d, depths, conics, radii = outputs
+        ctx.save_for_backward(means, quats, scales, radii)
+        ctx.lens = lens
+        return means2d, depths, conics
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        v_means2d, v_depths, v_conics = grads
+        means, quats, scales, radii = ctx.saved_tensors
+        outputs = (
+            torch.empty_like(means),
+            torch.empty_like(quats),
+            torch.empty_like(scales),
+        )
+        launch(
+            project_backward_kernels.project_backward,
+            *map(flat, (means, quats, scales)),
+            *ctx.lens.arguments(),
+            *map(flat, (radii, v_means2d, v_depths, v_conics)),
+            *map(flat, outputs),
+            items=_chunks(len(means)),
+        )
+        return *outputs, None, None
+
+
+def _chunks(count: int) -> int:
+    return -(-count // (GROUP * project_kernels.CHUNK))
+
+
+def project(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    camera: Camera,
+    near: float,
+    absgrad: bool,
+) -> Projection:
+    """See `wildgs.rasterize.project`."""
+    n = len(means)
+    means_, quats_, scales_, opacities_ = (_padded(t).contiguous() for t in (means, quats, scales, opacities))
+    lens = _Lens.of(camera)
+    count = len(means_)
+    means2d, depths = torch.empty(count, 2), torch.empty(count)
+    conics, radii = torch.empty(count, 3), torch.empty(count, dtype=torch.int32)
+    tile_counts = np.empty(count, np.int32)
+    with (
+        scratch("records", count * RECORD, np.float32) as records,
+        scratch("boxes", 4 * count, np.int16) as boxes,
+        scratch("masks", count, np.int32) as masks,
+    ):
+        launch(
+            project_kernels.project_forward,
+            *map(flat, (means_, quats_, scales_, opacities_)),
+            *lens.arguments(),
+            np.float32(near),
+            *map(flat, (means2d, depths, conics, radii)),
+            records, boxes, masks, tile_counts,
+            items=_chunks(count),
+        )  # fmt: skip
+        tiles = _list_tiles(depths.numpy(), records, boxes, masks, tile_counts, camera)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (means_, quats_, scales_)):
+        outputs = (means2d, depths, conics, radii)
+        means2d, depths, conics = _Project.apply(means_, quats_, scales_, lens, outputs)  # type: ignore[misc]
+    return Projection(
+        camera=camera,
+        means2d=_first(means2d, n),
+        depths=_first(depths, n),
+        conics=_first(conics, n),
+        opacities=opacities,
+        radii=_first(radii, n),
+        backend="cpu",
+        tiles=tiles,
+        absgrad=torch.zeros(n, 2) if absgrad else None,
+    )
+
+
+def _list_tiles(
+    depths: np.ndarray,
+    records: np.ndarray,
+    boxes: np.ndarray,
+    masks: np.ndarray,
+    tile_counts: np.ndarray,
+    camera: Camera,
+) -> TileLists:
+    """Ranks the Gaussians and lists each tile's, nearest first (see `tile_kernels`)."""
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    n = tile_counts.size
+    seen = int(np.count_nonzero(tile_counts))
+    ranks, homes = np.empty(n, np.int32), np.empty(seen, np.int32)
+    ranked_records, starts = (
+        np.empty(seen * RECORD, np.float32),
+        np.empty(seen + 1, np.int64),
+    )
+    offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
+    chunks = max(1, min(2 * thread_count(), n // 1024))
+    with (
+        scratch("cursors", chunks * tiles_x * tiles_y, np.int64) as counts,
+        scratch("spans", 4 * seen, np.int32) as spans,
+        scratch("keys", 2 * seen, np.uint32) as keys,
+        scratch("order", 2 * seen, np.int32) as order,
+    ):
+        cursors = counts.reshape(chunks, -1)
+        launch(tile_kernels.count_homes, tile_counts, boxes, tiles_x, cursors, items=chunks)
+        run_once(tile_kernels.place_chunks, cursors, offsets)
+        launch(
+            tile_kernels.move_home,
+            tile_counts, boxes, masks, records, tiles_x, cursors, ranks, homes, ranked_records, spans,
+            items=chunks,
+        )  # fmt: skip
+        pairs = run_once(tile_kernels.number_slots, spans, starts)
+        order = run_once(
+            tile_kernels.sort_by_depth, depths, ranks, keys[:seen], order[:seen], keys[seen:], order[seen:]
+        )  # fmt: skip
+        launch(
+            tile_kernels.count_pairs,
+            order,
+            spans,
+            ranked_records,
+            tiles_x,
+            cursors,
+            items=chunks,
+        )
+        run_once(tile_kernels.place_chunks, cursors, offsets)
+        ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
+        launch(
+            tile_kernels.write_pairs, order, spans, ranked_records, starts, tiles_x, cursors, ids, slots, items=chunks
+        )  # fmt: skip
+    # In powers of two of the length: within one, neighbouring tiles follow each other and share what is in the cache.
+    tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
+    return TileLists(ranks, homes, ranked_records, starts, offsets, ids, slots, tile_order)
