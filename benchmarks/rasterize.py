@@ -6,9 +6,9 @@
 
 The scene: half of the Gaussians on a facade at depth 4, the rest uniform between depths 2 and 6, log-normal scales
 around 0.01, opacities uniform in [0, 1], focal length 0.9 widths. A run blends three channels and depth. Forward
-includes projection, binning and sorting; backward reaches means, quaternions, scales, opacities and colours. The times
-are medians of at least 7 runs after warm-up; the shortest are given beside them, as they suffer less from other
-programs.
+includes projection, binning and sorting; backward reaches means, quaternions, scales, opacities and colours.
+The times are medians of at least 7 runs after warm-up; the shortest are given beside them, as they suffer less
+from other programs.
 
 The share of peak compares the blend's exponentials and multiply-adds with those of a kernel that does nothing else,
 timed between the runs on as many threads.
@@ -213,7 +213,8 @@ def table(rows: list[Row]) -> str:
             ratio = f"{r.times_faster_than_reference:.0f}"
         lines.append(
             f"| {r.backend} | {r.n} | {r.width}x{r.height} | {r.forward_ms:.1f} ({r.forward_min_ms:.1f}) |"
-            f" {r.backward_ms:.1f} ({r.backward_min_ms:.1f}) | {r.tile_pairs or '-'} | {rates} | {shares} | {ratio} |"
+            f" {r.backward_ms:.1f} ({r.backward_min_ms:.1f}) | {r.tile_pairs or '-'} |"
+            f" {rates} | {shares} | {ratio} |"
         )
     return "\n".join(lines)
 

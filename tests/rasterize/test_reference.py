@@ -42,7 +42,7 @@ def test_projection_gradients_match_finite_differences():
 
 
 def test_one_gaussian_by_hand():
-    """A round Gaussian straight ahead: its variance is (focal scale / depth)^2 + 0.3, its colour is alpha times it."""
+    """A round Gaussian straight ahead: its variance in pixels is (focal scale / depth)^2 + 0.3."""
     camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 2.5], [0, 10.0, 2.5], [0, 0, 1]]), 5, 5)
     for backend in ("reference", "cpu"):
         projection = project(

@@ -33,7 +33,7 @@ from wildgs.rasterize.cpu.forward_kernels import (
     Y,
     load_batch,
 )
-from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, load_block
+from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, ask_for_tile, load_block
 from wildgs.rasterize.cpu.reach_kernels import MIN_LEVEL, TILE, reach
 from wildgs.rasterize.cpu.simd import (
     LANES,
@@ -71,15 +71,16 @@ def load_tile(
         vstore(v, at + REACHED, vload(last, tile * PIXELS + block * LANES))
         if x < width and y < height:
             load_block(
-                x, y, width, height, channels, with_depth, background, out_depth, out_alpha, v_colors, v_depth, v_alpha,
-                patch, v, at + V_ALPHA, at + V_DEPTH, at + V_COLORS,
+                x, y, width, height, channels, with_depth, background, out_depth, out_alpha,
+                v_colors, v_depth, v_alpha, patch, v, at + V_ALPHA, at + V_DEPTH, at + V_COLORS,
             )  # fmt: skip
 
 
 @njit(nogil=True, cache=True)
 def blend_backward(
     counter, tile_order, offsets, ids, slots, records, values, channels, with_depth, background,
-    width, height, final_transmittance, last, out_depth, out_alpha, v_colors, v_depth, v_alpha, row_size, rows, absgrad,
+    width, height, final_transmittance, last, out_depth, out_alpha, v_colors, v_depth, v_alpha,
+    row_size, rows, absgrad,
 ):  # fmt: skip
     """Writes one row of `row_size` floats per (tile, Gaussian) pair into `rows`, at the pair's slot."""
     tiles_x = (width + TILE - 1) // TILE
@@ -93,15 +94,28 @@ def blend_backward(
     for block in range(16):
         vstore(places, block * 2 * LANES, lane_x() + np.float32((block & 3) * 4))
         vstore(places, block * 2 * LANES + LANES, lane_y() + np.float32((block >> 2) * 4))
-    while True:
-        item = fetch_add(counter, 1)
-        if item >= tile_order.size:
-            break
+    following = fetch_add(counter, 1)
+    while following < tile_order.size:
+        # The next tile's pixels are asked for while this one is worked on.
+        item, following = following, fetch_add(counter, 1)
+        if following < tile_order.size:
+            soon = tile_order[following]
+            sx, sy = soon % tiles_x, soon // tiles_x
+            ask_for_tile(sx, sy, width, height, channels, v_colors, False)
+            ask_for_tile(sx, sy, width, height, 1, v_alpha, False)
+            for i in range(0, PIXELS, LANES):
+                prefetch(final_transmittance, soon * PIXELS + i)
+                prefetch(last, soon * PIXELS + i)
+            if with_depth:
+                ask_for_tile(sx, sy, width, height, 1, v_depth, False)
+                ask_for_tile(sx, sy, width, height, 1, out_depth, False)
+                ask_for_tile(sx, sy, width, height, 1, out_alpha, False)
         tile = tile_order[item]
         tx, ty = tile % tiles_x, tile // tiles_x
         begin = offsets[tile]
         load_tile(
-            tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth, out_alpha,
+            tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last,
+            out_depth, out_alpha,
             v_colors, v_depth, v_alpha, stride, patch, v,
         )  # fmt: skip
         end = 0
@@ -125,7 +139,8 @@ def blend_backward(
                 )  # fmt: skip
             for i in range(stop - start - 1, -1, -1):
                 gather_pair(
-                    i, np.float32(start + i + 1), masks[i], batch, channels, with_depth, values, ids[first + i], absgrad,
+                    i, np.float32(start + i + 1), masks[i], batch, channels, with_depth, values,
+                    ids[first + i], absgrad,
                     stride, v, places, v_color, rows, slots[first + i] * row_size,
                 )  # fmt: skip
 

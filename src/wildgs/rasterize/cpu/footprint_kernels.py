@@ -1,4 +1,4 @@
-"""Numba (njit) functions of the projection that its forward and backward pass share, on sixteen Gaussians at a time."""
+"""Numba (njit) functions that the projection's forward and backward pass share, on sixteen Gaussians at a time."""
 
 from __future__ import annotations
 

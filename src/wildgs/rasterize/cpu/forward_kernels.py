@@ -3,8 +3,9 @@
 A tile of 16 x 16 pixels is sixteen blocks of 4 x 4; a block is one vector. For each Gaussian of the tile's list
 only the blocks that it reaches and that still let light through are visited.
 
-A block's numbers lie together in memory: transmittance, alpha and depth sums, then the channels' sums. Transmittance doubles as
-the pixels' state: negative where the pixel is saturated (its value is the magnitude) or outside the picture.
+A block's numbers lie together in memory: transmittance, alpha and depth sums, then the channels' sums.
+Transmittance doubles as the pixels' state: negative where the pixel is saturated (its value is the
+magnitude) or outside the picture.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, close_tile, open_tile
+from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, ask_for_tile, close_tile, open_tile
 from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, REACH, RECORD, TILE, nearest_exponent
 from wildgs.rasterize.cpu.simd import (
     LANES,
@@ -120,6 +121,10 @@ def blend_forward(
             break
         tile = tile_order[item]
         tx, ty = tile % tiles_x, tile // tiles_x
+        ask_for_tile(tx, ty, width, height, channels, out_colors, True)
+        ask_for_tile(tx, ty, width, height, 1, out_alpha, True)
+        if with_depth:
+            ask_for_tile(tx, ty, width, height, 1, out_depth, True)
         alive = open_tile(tx, ty, width, height, stride, sums)
         reached[:] = 0.0
         begin, end = offsets[tile], offsets[tile + 1]
@@ -147,7 +152,8 @@ def blend_forward(
                     word &= word - 1
                     dx, dy = px + batch[X + i], py + batch[Y + i]
                     exponent = fma(
-                        dx, fma(dx, batch[QA + i], dy * batch[QB + i]), fma(dy * batch[QC + i], dy, batch[LEVEL + i])
+                        dx, fma(dx, batch[QA + i], dy * batch[QB + i]),
+                        fma(dy * batch[QC + i], dy, batch[LEVEL + i]),
                     )  # fmt: skip
                     hit = (exponent >= MIN_LEVEL) & (before > 0.0)
                     alpha = vmin(vexp2(exponent), MAX_ALPHA)
@@ -185,7 +191,8 @@ def blend_forward(
                 if mask_bits(before > 0.0) == 0:
                     alive &= ~(1 << block)
         close_tile(
-            tx, ty, width, height, channels, with_depth, background, stride, sums, patch, out_colors, out_depth, out_alpha
+            tx, ty, width, height, channels, with_depth, background, stride, sums, patch,
+            out_colors, out_depth, out_alpha,
         )  # fmt: skip
         if last is not None:
             for block in range(16):

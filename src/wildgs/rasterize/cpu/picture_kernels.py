@@ -7,7 +7,7 @@ from numba import njit
 
 from wildgs.rasterize.cpu.reach_kernels import TILE
 from wildgs.rasterize.cpu.simd import select, splat, vmax, vmin
-from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore3
+from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vload3, vstore, vstore3
 
 LANES = 16
 PATCH = 48  # floats that a block of three channels has
@@ -49,6 +49,18 @@ def get_rows(patch, per_pixel, picture, x, y, width, height):
         else:
             for k in range(count):
                 patch[line * row + k] = picture[at + k]
+
+
+@njit(nogil=True, cache=True)
+def ask_for_tile(tx, ty, width, height, per_pixel, picture, to_write):
+    """Asks for the cache lines of a tile in a picture: its rows lie far apart, and no hardware foresees them."""
+    for line in range(min(TILE, height - ty * TILE)):
+        at = ((ty * TILE + line) * width + tx * TILE) * per_pixel
+        for step in range(0, TILE * per_pixel, LANES):
+            if to_write:
+                prefetch_to_write(picture, at + step)
+            else:
+                prefetch(picture, at + step)
 
 
 @njit(nogil=True, cache=True)

@@ -107,8 +107,8 @@ def project_group(
 ):  # fmt: skip
     """Sixteen Gaussians from index i.
 
-    `spans` takes radii and the boxes' first and last tiles. Returns, for the box's first tile, the one to its right,
-    the one below and the one beyond both, a bit per Gaussian that reaches it.
+    `spans` takes radii and the boxes' first and last tiles. Returns, for the box's first tile, the one to its
+    right, the one below and the one beyond both, a bit per Gaussian that reaches it.
     """
     R = camera_numbers(view)
     px, py, pz = vload3(means, 3 * i)

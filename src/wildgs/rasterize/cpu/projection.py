@@ -24,7 +24,7 @@ GROUP = project_kernels.GROUP
 class TileLists:
     """What blending needs to know of the geometry; arrays are flat.
 
-    Gaussians that reach the picture are numbered by rank, so that neighbours in the picture are neighbours in memory.
+    Gaussians that reach the picture are numbered by rank: neighbours in the picture are neighbours in memory.
 
     Attributes:
         ranks: Each Gaussian's rank; -1 where it reaches no tile.
@@ -216,8 +216,9 @@ def _list_tiles(
         run_once(tile_kernels.place_chunks, cursors, offsets)
         ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
         launch(
-            tile_kernels.write_pairs, order, spans, ranked_records, starts, tiles_x, cursors, ids, slots, items=chunks
+            tile_kernels.write_pairs, order, spans, ranked_records, starts, tiles_x, cursors, ids, slots,
+            items=chunks,
         )  # fmt: skip
-    # In powers of two of the length: within one, neighbouring tiles follow each other and share what is in the cache.
+    # By powers of two of the length: within one, neighbouring tiles follow each other and share the cache.
     tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
     return TileLists(ranks, homes, ranked_records, starts, offsets, ids, slots, tile_order)

@@ -11,7 +11,8 @@ from numba import njit
 from wildgs.rasterize.cpu.simd import fma, lane_x, lane_y, mask_bits, vmax, vmin
 
 TILE = 16
-RECORD = 8  # floats per Gaussian: x, y, A, B, C, level, -B / 2C, -B / 2A; log2 alpha = A dx^2 + B dx dy + C dy^2 + level
+# Floats per Gaussian: x, y, A, B, C, level, -B / 2C, -B / 2A, with log2 alpha = A dx^2 + B dx dy + C dy^2 + level.
+RECORD = 8
 MIN_LEVEL = np.float32(-7.99435344)  # log2(1/255)
 REACH = np.float32(-7.99435344 - 0.01)
 HALF = np.float32(0.5)

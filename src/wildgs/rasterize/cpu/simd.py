@@ -24,7 +24,7 @@ VECTOR_IR = ir.VectorType(_FLOAT, LANES)
 INT_VECTOR = ir.VectorType(ir.IntType(32), LANES)
 _MASK_VECTOR = ir.VectorType(ir.IntType(1), LANES)
 # NaN and infinity keep their meaning: culling depends on comparisons with them being false. Nothing is fused or
-# reordered behind the kernels' back (`fma` says where), so that a test gives the same answer wherever it is inlined.
+# reordered behind the kernels' back (`fma` says where): a test gives the same answer wherever it is inlined.
 _FLAGS = ("nsz",)
 
 

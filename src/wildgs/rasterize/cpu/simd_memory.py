@@ -1,4 +1,4 @@
-"""Loads, stores, prefetches and the atomic counter of Numba (njit) kernels that hold their values in `simd` vectors."""
+"""Loads, stores, prefetches and the atomic counter of Numba (njit) kernels that compute with `simd` vectors."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _columns_storer(count: int) -> Any:
 
 
 def _pick(builder: ir.IRBuilder, vectors: list[ir.Value], sources: list[int]) -> ir.Value:
-    """A vector whose lanes come from the concatenation of several; one two-source shuffle for each but the first."""
+    """A vector whose lanes come from several others; one shuffle of two sources for each but the first."""
     result = vectors[0]
     for i in range(1, len(vectors)):
         numbers = []
