@@ -1,8 +1,8 @@
 """Numba (njit) kernels that make the tile lists: which Gaussians each tile blends, nearest first.
 
 Gaussians come in any order. They are first put in order of the tile in which their box starts ("rank"), so that
-what a tile and its neighbours read and write lies together in memory. Sorting by depth happens once, over Gaussians;
-a counting sort of their (tile, Gaussian) pairs keeps that order in every tile.
+what a tile and its neighbours read and write lies together in memory. Sorting by depth happens once, over the
+Gaussians; a counting sort of their (tile, Gaussian) pairs keeps that order in every tile.
 
 Counting sorts run on several threads: each chunk of the input counts for itself, `place_chunks` gives every
 chunk its own places, and the result is that of one thread.
