@@ -87,6 +87,15 @@ def test_oversized_and_broken_gaussians_go(method: VanillaGS) -> None:
     assert len(method.gaussians) == 1
 
 
+def test_what_fills_the_picture_goes_once_opacities_were_reset(method: VanillaGS) -> None:
+    control, optimizers = controlled(method, [0.0] * 4)
+    control.reach = torch.tensor([0.1, 0.2, 0.0, 0.1])
+    assert round_of(control, method, optimizers).pruned == 1, "the faint one"
+    control.reach = torch.tensor([0.1, 0.2, 0.1])
+    assert round_of(control, method, optimizers, large=True).pruned == 1
+    assert control.reach.tolist() == [0.0, 0.0]
+
+
 def test_a_scene_is_never_pruned_to_nothing(method: VanillaGS) -> None:
     control, optimizers = controlled(method, [0.0] * 4)
     with torch.no_grad():
@@ -119,3 +128,4 @@ def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:
     expected = torch.where(projection.visible, torch.tensor([3.0 * 32, 4.0 * 16]).norm(), 0.0)
     torch.testing.assert_close(control.gradient_sum, expected)
     assert torch.equal(control.seen, projection.visible.float())
+    torch.testing.assert_close(control.reach, projection.radii / 64)

@@ -27,6 +27,8 @@ class DensityConfig:
         split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
         prune_opacity: Fainter Gaussians go.
         prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
+        prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
+            of them float right before a camera and stand for what stood in its way.
         reset_opacity: Opacities are lowered to this at a reset.
         max_gaussians: No growth beyond this number.
     """
@@ -35,6 +37,7 @@ class DensityConfig:
     split_scale: float = 0.01
     prune_opacity: float = 0.005
     prune_scale: float = 0.1
+    prune_reach: float = 0.15
     reset_opacity: float = 0.01
     max_gaussians: int = 3_000_000
 
@@ -61,12 +64,24 @@ class DensityControl:
         """
         self.config = config
         self.extent = extent
-        self.gradient_sum = torch.zeros(num_gaussians)
-        self.seen = torch.zeros(num_gaussians)
+        self._clear(num_gaussians, torch.device("cpu"))
+
+    def _clear(self, num_gaussians: int, device: torch.device) -> None:
+        self.gradient_sum = torch.zeros(num_gaussians, device=device)
+        self.seen = torch.zeros(num_gaussians, device=device)
+        self.reach = torch.zeros(num_gaussians, device=device)
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs."""
+        return {"gradient_sum": self.gradient_sum, "seen": self.seen, "reach": self.reach}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Goes on where `state` was taken."""
+        self.gradient_sum, self.seen, self.reach = (state[k] for k in ("gradient_sum", "seen", "reach"))
 
     @torch.no_grad()
     def gather(self, projection: Projection) -> None:
-        """Adds one view's screen gradients; call after the backward pass."""
+        """Adds one view's screen gradients and reaches; call after the backward pass."""
         gradient = projection.means2d.grad
         if gradient is None:
             return
@@ -75,6 +90,8 @@ class DensityControl:
         norm = (gradient * half).norm(dim=-1)
         self.gradient_sum = self.gradient_sum.to(norm.device) + torch.where(visible, norm, 0.0)
         self.seen = self.seen.to(norm.device) + visible
+        share = projection.radii / max(projection.camera.width, projection.camera.height)
+        self.reach = torch.maximum(self.reach.to(norm.device), share)
 
     @torch.no_grad()
     def densify(
@@ -101,6 +118,7 @@ class DensityControl:
         prune = gaussians.opacities < self.config.prune_opacity
         if prune_large:
             prune = prune | (largest > self.config.prune_scale * self.extent)
+            prune = prune | (self.reach.to(prune.device) > self.config.prune_reach)
         finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)
         prune = prune | ~finite
         clones, splits = clones & ~prune, splits & ~prune
@@ -111,8 +129,7 @@ class DensityControl:
         if not keep.any() and not splits.any():
             return DensityReport(0, 0, 0)
         edit_rows(gaussians, optimizer, keep, added)
-        self.gradient_sum = torch.zeros(len(gaussians), device=scales.device)
-        self.seen = torch.zeros(len(gaussians), device=scales.device)
+        self._clear(len(gaussians), scales.device)
         return DensityReport(int(clones.sum()), int(splits.sum()), int(prune.sum()))
 
     def _select_growing(self) -> Bool[Tensor, "N"]:

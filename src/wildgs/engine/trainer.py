@@ -172,8 +172,7 @@ class Trainer:
         state = {f"method.{name}": value for name, value in self.method.state_dict().items()}
         state |= {f"optimizer.{name}": value for name, value in self.optimizers.state().items()}
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
-        state["density.gradient_sum"] = self.density.gradient_sum
-        state["density.seen"] = self.density.seen
+        state |= {f"density.{name}": value for name, value in self.density.state().items()}
         state["random.generator"] = self.generator.get_state()
         state["progress.step"] = torch.tensor(self.step)
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
@@ -183,8 +182,7 @@ class Trainer:
         """Goes on from `state`; the method must have been restored from the same checkpoint already."""
         self.optimizers.restore(_under(state, "optimizer."))
         self.sampler.restore(_under(state, "sampler."))
-        self.density.gradient_sum = state["density.gradient_sum"].to(self.device)
-        self.density.seen = state["density.seen"].to(self.device)
+        self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
