@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 import warnings
 
@@ -33,8 +32,6 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments[0] == "--version":
         print(f"wildgs {__version__}")
         return
-    # Threads that spin while they wait cost many times the work itself as soon as cores are shared.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     verb, *rest = arguments
     if verb not in VERBS:
         _fail(f"there is no verb {verb!r}; `wildgs --help` lists them")
