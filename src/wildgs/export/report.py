@@ -48,7 +48,7 @@ class ReportExample:
     depth: UInt8[np.ndarray, "H W 3"] | Float[np.ndarray, "H W"]
     clean: UInt8[np.ndarray, "H W 3"] | None = None
     baseline: UInt8[np.ndarray, "H W 3"] | None = None
-    relit: tuple[tuple[str, UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "H W 3"]], ...] = ()
+    relit: tuple[tuple[str, UInt8[np.ndarray, "_ _ 3"], UInt8[np.ndarray, "H W 3"]], ...] = ()
     baseline_name: str = "3DGS"
 
 
