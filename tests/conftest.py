@@ -11,7 +11,6 @@ from jaxtyping import install_import_hook
 
 # Tests need no network: what is not on disk is not to be had, at once.
 os.environ["HF_HUB_OFFLINE"] = "1"
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 SOURCE = Path(__file__).parent.parent / "src"
 SHARED = Path(__file__).parents[2] / "shared"
