@@ -34,6 +34,12 @@ def test_short_runs_stay_sane(steps: int) -> None:
     assert schedule.progress(steps - 1) == (1.0 if steps > 1 else 0.0)
 
 
+def test_masks_get_time_in_short_runs() -> None:
+    assert Schedule(ScheduleConfig(), 2500).first_stage == 500
+    assert Schedule(ScheduleConfig(), 2500).densify_from == 250
+    assert Schedule(ScheduleConfig(), 1000).first_stage == 200
+
+
 def test_stages() -> None:
     schedule = Schedule(ScheduleConfig(), 30_000)
     assert not schedule.stage(2999, 3).explicit

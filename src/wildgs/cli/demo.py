@@ -11,9 +11,12 @@ from wildgs.cli.showcase import Scores, write_showcase
 from wildgs.cli.train import read_scene, train_to_end
 from wildgs.config import RunConfig
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
+from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
+from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import MethodName
+from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import load_run, start_training
 
 TITLES: dict[MethodName, str] = {"wildgs": "Wild-GS", "3dgs": "3DGS"}
@@ -22,6 +25,10 @@ SUMMARY = (
     "the way. Wild-GS and plain 3D Gaussian Splatting were trained on their photos for the same number of steps; "
     "both are scored on photos that neither has seen, against the same views without passers-by."
 )
+
+
+MODEL = WildGSConfig(parsing=ParsingConfig(max_side=160))
+MAX_GAUSSIANS = 30_000
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,7 @@ class Command:
 
     output: Path = Path("wildgs-demo")
     """Folder for the scene, both runs and report.html."""
-    steps: int = 1800
+    steps: int = 1500
     """Training steps of each method."""
     photos: int = 40
     """How many visitors take a photo."""
@@ -58,7 +65,7 @@ def run(command: Command) -> None:
             )
     runs = []
     for method in ("wildgs", "3dgs"):
-        config = RunConfig(folder.resolve(), method, train=TrainConfig(steps=command.steps))
+        config = RunConfig(folder.resolve(), method, model=MODEL, train=_training(command.steps))
         scene = read_scene(config)
         target = command.output / method
         train_to_end(target, config, scene, start_training(target, config, scene))
@@ -71,3 +78,8 @@ def run(command: Command) -> None:
     print_scores({name: scores for name, _, scores in runs})
     write_showcase(page, "Wild-GS demo", SUMMARY, scene, runs)
     console.print(f"open {page.resolve()} in a browser")
+
+
+def _training(steps: int) -> TrainConfig:
+    """The defaults, with no more Gaussians than photos this small can tell apart."""
+    return TrainConfig(steps=steps, density=DensityConfig(max_gaussians=MAX_GAUSSIANS))

@@ -16,11 +16,13 @@ from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
 from wildgs.data.photos import SfmConfig
+from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.runs import default_device, load_run, start_training
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
+CPU_MAX_GAUSSIANS = 80_000
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,8 @@ def _configure(command: Command, folder: Path) -> tuple[RunConfig, Scene]:
     steps = command.steps or (GPU_STEPS if gpu else CPU_STEPS)
     downscale = command.downscale or _downscale_for(folder, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE)
     data = DataConfig(downscale=downscale, holdout=command.holdout)
-    config = RunConfig(folder.resolve(), "wildgs", data, train=TrainConfig(steps=steps))
+    budget = DensityConfig() if gpu else DensityConfig(max_gaussians=CPU_MAX_GAUSSIANS)
+    config = RunConfig(folder.resolve(), "wildgs", data, train=TrainConfig(steps=steps, density=budget))
     return config, read_scene(config)
 
 

@@ -34,7 +34,17 @@ class ScheduleConfig:
     sh_every: int = 1000
 
 
-_FLOORS = {"densify_from": 150, "densify_every": 50, "reset_every": 1000, "mask_pause": 100, "sh_every": 100}
+_FLOORS = {
+    "first_stage": 500,
+    "densify_from": 250,
+    "densify_every": 50,
+    "reset_every": 1000,
+    "mask_pause": 100,
+    "sh_every": 100,
+}
+"""Least steps in a short run: a mask needs so many to become useful, whatever the run's length."""
+_FLOOR_SHARE = 5
+"""A floor takes at most this part (one in five) of a run."""
 
 
 class Schedule:
@@ -60,6 +70,8 @@ class Schedule:
     def _scaled(self, paper_steps: int, name: str) -> int:
         scaled = round(paper_steps * self._factor)
         floor = min(_FLOORS.get(name, 1), paper_steps)
+        if name != "reset_every":
+            floor = min(floor, max(1, self.steps // _FLOOR_SHARE))
         return max(scaled, floor)
 
     def progress(self, step: int) -> float:
