@@ -19,7 +19,9 @@ def test_basis_is_orthonormal_on_the_sphere():
 
 def test_degree_1_follows_minus_y_z_minus_x():
     axes = torch.eye(3)
-    assert torch.allclose(sh_basis(1, axes)[:, 1:], 0.4886025 * torch.tensor([[0, 0, -1], [-1, 0, 0], [0, 1.0, 0]]))
+    assert torch.allclose(
+        sh_basis(1, axes)[:, 1:], 0.4886025 * torch.tensor([[0, 0, -1], [-1, 0, 0], [0, 1.0, 0]])
+    )
 
 
 def test_lower_degrees_are_prefixes():
