@@ -26,7 +26,9 @@ def masked_photometric(
 
     The value is the formula's, and so is the gradient to the render. The gradient to the mask is not: through
     SSIM of two pictures that share a factor M, a mask lowers the loss by being textured itself, and learns the
-    scene's edges instead of passers-by. Here hiding a pixel is worth what the pixel costs: its `mismatch`.
+    scene's edges instead of passers-by. Here hiding a pixel is worth what the pixel's `mismatch` exceeds the
+    photo's median by: while all of a photo is still wrong, nothing is transient, and the mask cannot settle on
+    hiding everything.
 
     Args:
         photo: The reference photo I, in 0..1.
@@ -42,8 +44,10 @@ def masked_photometric(
     fixed = visibility.detach()
     loss = _photometric(photo * fixed[..., None], render * fixed[..., None], weight_l1)
     if visibility.requires_grad:
-        # Adds nothing to the value, and the mismatch to the mask's gradient.
-        loss = loss + ((visibility - fixed) * mismatch(photo, render.detach(), weight_l1)).mean()
+        cost = mismatch(photo, render.detach(), weight_l1)
+        excess = (cost - cost.median()).clamp_min(0)
+        # Adds nothing to the value, and the excess to the mask's gradient.
+        loss = loss + ((visibility - fixed) * excess).mean()
     return loss
 
 
