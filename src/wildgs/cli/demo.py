@@ -21,7 +21,7 @@ from wildgs.runs import load_run, start_training
 
 TITLES: dict[MethodName, str] = {"wildgs": "Wild-GS", "3dgs": "3DGS"}
 SUMMARY = (
-    "A landmark made in code and photographed by forty imagined visitors: other hours, other cameras, people in "
+    "A landmark made in code and photographed by {photos} imagined visitors: other hours, other cameras, people in "
     "the way. Wild-GS and plain 3D Gaussian Splatting were trained on their photos for the same number of steps; "
     "both are scored on photos that neither has seen, against the same views without passers-by."
 )
@@ -76,7 +76,7 @@ def run(command: Command) -> None:
         }
         runs.append((TITLES[method], loaded, scores))
     print_scores({name: scores for name, _, scores in runs})
-    write_showcase(page, "Wild-GS demo", SUMMARY, scene, runs)
+    write_showcase(page, "Wild-GS demo", SUMMARY.format(photos=command.photos), scene, runs)
     console.print(f"open {page.resolve()} in a browser")
 
 
