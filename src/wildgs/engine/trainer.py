@@ -104,18 +104,23 @@ class Trainer:
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step."""
-        if self.step == 0:
-            self._prepare()
-        set_precision(self.method, choose_precision(self.config.precision, self.device))
+        self.begin()
         try:
             while self.step < self.config.steps:
-                report = self._advance()
+                report = self.advance()
                 for observer in observers:
                     observer(report)
         finally:
             set_precision(self.method, torch.float32)
 
-    def _advance(self) -> StepReport:
+    def begin(self) -> None:
+        """Gets the method ready for `advance`; `run` does it by itself."""
+        if self.step == 0:
+            self._prepare()
+        set_precision(self.method, choose_precision(self.config.precision, self.device))
+
+    def advance(self) -> StepReport:
+        """One step on one photo."""
         start = time.perf_counter()
         view = self.views[self.sampler.next()]
         self.optimizers.set_progress(self.schedule.progress(self.step))
