@@ -34,8 +34,8 @@ from wildgs.geometry.camera import Camera
 from wildgs.rasterize import BackendName, Projection, blend, project
 from wildgs.rasterize.cpu.reach_kernels import HALF, RECORD, count_bits, reach
 from wildgs.rasterize.cpu.simd import fma, splat, vexp2
-from wildgs.rasterize.cpu.simd_memory import fetch_add, vstore
-from wildgs.rasterize.cpu.threads import launch, thread_count
+from wildgs.rasterize.cpu.simd_memory import vstore
+from wildgs.threads import fetch_add, launch, thread_count
 
 SIZES = ((320, 240), (640, 480), (1280, 960))
 COUNTS = (10_000, 100_000, 1_000_000)

@@ -32,10 +32,8 @@ from torch import Tensor
 
 from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
-from wildgs.engine.density import DensityConfig, DensityControl
-from wildgs.engine.optimizers import Optimizers
+from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
-from wildgs.model.gaussians import Gaussians
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
@@ -93,11 +91,14 @@ class StageClock:
         self._hooked: dict[int, Tensor] = {}  # a stage may hand on another's tensors
 
     def now(self) -> float:
+        """Seconds, with the device idle."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return time.perf_counter()
 
     def wrap(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, with its time going to a stage."""
+
         def timed(*arguments: Any, **options: Any) -> Any:
             self._inside.append(0.0)
             start = self.now()
@@ -168,7 +169,9 @@ def make_scene(folder: Path, long_side: int) -> Scene:
     return load_scene(folder, DataConfig(holdout=0))
 
 
-def make_trainer(name: MethodName, scene: Scene, n: int, device: torch.device, model: WildGSConfig) -> Trainer:
+def make_trainer(
+    name: MethodName, scene: Scene, n: int, device: torch.device, model: WildGSConfig
+) -> Trainer:
     """A trainer at the start of the second stage, with N Gaussians."""
     generator = torch.Generator().manual_seed(0)
     source = torch.randint(len(scene.points), (n,), generator=generator)
@@ -259,7 +262,9 @@ def show(rows: list[Row]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="100k Gaussians at 480x360 alone")
     parser.add_argument("--json", action="store_true", help="only the rows, on stdout")
     parser.add_argument("--steps", type=int, default=12, help="timed steps a method")

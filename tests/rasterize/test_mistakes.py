@@ -8,7 +8,7 @@ import torch
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize import blend, pick_backend, project, rasterize
-from wildgs.rasterize.cpu.threads import thread_count
+from wildgs.threads import thread_count
 
 CAMERA = Camera(torch.eye(4), torch.eye(3), 8, 8)
 

@@ -117,7 +117,7 @@ def _numba() -> Check:
     import torch
 
     from wildgs.losses.ssim import ssim
-    from wildgs.rasterize.cpu.threads import thread_count
+    from wildgs.threads import thread_count
 
     picture = torch.linspace(0, 1, 16 * 16 * 3).view(16, 16, 3)
     value = float(ssim(picture, picture))

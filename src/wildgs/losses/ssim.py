@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -14,7 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from wildgs.losses.ssim_kernels import RADIUS, ssim_backward, ssim_forward
+from wildgs.losses.ssim_kernels import RADIUS, blocks, ssim_backward, ssim_forward
+from wildgs.threads import launch
 
 SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
@@ -55,8 +51,16 @@ class _CpuSSIM(torch.autograd.Function):
         row_sums = torch.empty(height, dtype=x.dtype)
         c1, c2 = taps.dtype.type(C1), taps.dtype.type(C2)
         pictures = _matrix(x), _matrix(y)
-        _on_all_threads(
-            ssim_forward, height, *pictures, taps, c1, c2, channels, derivatives.numpy(), row_sums.numpy()
+        launch(
+            ssim_forward,
+            *pictures,
+            taps,
+            c1,
+            c2,
+            channels,
+            derivatives.numpy(),
+            row_sums.numpy(),
+            items=blocks(height),
         )
         ctx.save_for_backward(x, y, derivatives)
         return (row_sums.sum(dtype=torch.float64) / x.numel()).to(x.dtype)
@@ -68,32 +72,17 @@ class _CpuSSIM(torch.autograd.Function):
         scale = taps.dtype.type(grads[0].item() / x.numel())
         grad_x, grad_y = torch.empty_like(x), torch.empty_like(y)
         pictures, grads_out = (_matrix(x), _matrix(y)), (_matrix(grad_x), _matrix(grad_y))
-        _on_all_threads(
-            ssim_backward, x.shape[0], *pictures, taps, scale, x.shape[2], derivatives.numpy(), *grads_out
+        launch(
+            ssim_backward,
+            *pictures,
+            taps,
+            scale,
+            x.shape[2],
+            derivatives.numpy(),
+            *grads_out,
+            items=blocks(x.shape[0]),
         )
         return grad_x, grad_y
-
-
-@cache
-def _pool(process: int, workers: int) -> ThreadPoolExecutor:
-    """One a process, since threads do not survive a fork."""
-    return ThreadPoolExecutor(workers, thread_name_prefix="wildgs-ssim")
-
-
-def _on_all_threads(kernel: Callable[..., None], height: int, *arguments: Any) -> None:
-    """Calls a kernel for bands of rows on as many threads as torch uses.
-
-    Not Numba's own threads: OpenMP's spin after their work and hinder whatever runs next, many times the cost
-    of the kernel where cores are shared.
-    """
-    bands = max(1, min(torch.get_num_threads(), height // 16))
-    edges = [height * i // bands for i in range(bands + 1)]
-    others = list(pairwise(edges[1:]))
-    pool = _pool(os.getpid(), bands - 1) if others else None
-    pending = [pool.submit(kernel, *band, *arguments) for band in others] if pool else []
-    kernel(0, edges[1], *arguments)
-    for job in pending:
-        job.result()
 
 
 def _matrix(picture: Tensor) -> Any:

@@ -1,9 +1,8 @@
 """Numba kernels of the structural similarity and its gradient.
 
 A picture is a matrix of H rows and L = W * C numbers (channels interleaved), so that one inner loop runs over
-all channels of a row and the horizontal window steps by C. A call does the rows from `first` to `last` and
-writes to no other, so calls for different rows may run at the same time, and results do not depend on how
-many there are.
+all channels of a row and the horizontal window steps by C. Threads draw blocks of `BLOCK` rows, and a row's
+results go to that row alone, so results do not depend on how many threads there are.
 """
 
 from __future__ import annotations
@@ -11,7 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from wildgs.threads import fetch_add
+
 RADIUS = 5
+BLOCK = 16
 _MATHS = {"reassoc", "contract", "arcp", "nsz"}  # not nnan: a NaN must stay visible
 
 
@@ -35,8 +37,8 @@ def _filter_row(padded, taps, channels, out):
 
 
 @njit(nogil=True, fastmath=_MATHS, error_model="numpy", cache=True)
-def ssim_forward(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums):
-    """Sum the SSIM map per row and keep its derivatives by the window's moments.
+def _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums):
+    """Rows of `ssim_forward`.
 
     With E the window's weighted mean, `derivatives` [4, H, L] takes those of ssim by E[x], E[y], E[x^2] (the
     same as by E[y^2]) and E[xy].
@@ -82,8 +84,8 @@ def ssim_forward(first, last, x, y, taps, c1, c2, channels, derivatives, row_sum
 
 
 @njit(nogil=True, fastmath=_MATHS, error_model="numpy", cache=True)
-def ssim_backward(first, last, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
-    """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept.
+def _backward_rows(first, last, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
+    """Rows of `ssim_backward`.
 
     The window is symmetric, so the adjoint of filtering with zero padding is the same filtering.
     """
@@ -110,3 +112,30 @@ def ssim_backward(first, last, x, y, taps, scale, channels, derivatives, grad_x,
         for j in range(length):
             out_x[j] = m0[j] + 2 * m2[j] * u[j] + m3[j] * v[j]
             out_y[j] = m1[j] + 2 * m2[j] * v[j] + m3[j] * u[j]
+
+
+@njit(nogil=True, error_model="numpy", cache=True)
+def ssim_forward(counter, x, y, taps, c1, c2, channels, derivatives, row_sums):
+    """Sum the SSIM map per row and keep its derivatives by the window's moments."""
+    while True:
+        first = fetch_add(counter, 1) * BLOCK
+        if first >= len(x):
+            break
+        last = min(first + BLOCK, len(x))
+        _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums)
+
+
+@njit(nogil=True, error_model="numpy", cache=True)
+def ssim_backward(counter, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
+    """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept."""
+    while True:
+        first = fetch_add(counter, 1) * BLOCK
+        if first >= len(x):
+            break
+        last = min(first + BLOCK, len(x))
+        _backward_rows(first, last, x, y, taps, scale, channels, derivatives, grad_x, grad_y)
+
+
+def blocks(height: int) -> int:
+    """How many blocks of rows there are to draw."""
+    return -(-height // BLOCK)

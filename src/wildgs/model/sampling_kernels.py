@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from wildgs.rasterize.cpu.simd_memory import fetch_add
+from wildgs.threads import fetch_add
 
 BANDS = 8
 """Row bands a plane, each scattered by one thread alone: no atomics, and the same sums for any thread count."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from wildgs.model.sampling_kernels import sample_backward, sample_forward
-from wildgs.rasterize.cpu.threads import launch
+from wildgs.threads import launch
 
 PLANE_AXES = ((0, 1), (1, 2), (2, 0))
 VIEW_AXIS = (2, 0, 1)

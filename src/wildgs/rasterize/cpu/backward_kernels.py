@@ -49,7 +49,8 @@ from wildgs.rasterize.cpu.simd import (
     vmax,
     vmin,
 )
-from wildgs.rasterize.cpu.simd_memory import fetch_add, prefetch, prefetch_to_write, vload, vstore
+from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vstore
+from wildgs.threads import fetch_add
 
 # A pair's row: six moments, |d x|, |d y| (absgrad), depth, then colours; whole vectors.
 ROW_ABS, ROW_DEPTH, ROW_COLORS = 6, 8, 9

@@ -13,8 +13,8 @@ from wildgs.rasterize.cpu import backward_kernels, forward_kernels, tile_kernels
 from wildgs.rasterize.cpu.projection import TileLists
 from wildgs.rasterize.cpu.reach_kernels import TILE
 from wildgs.rasterize.cpu.scratch import scratch
-from wildgs.rasterize.cpu.threads import flat, launch
 from wildgs.rasterize.interface import Projection, Rendering
+from wildgs.threads import flat, launch
 
 _CHUNK = 1024  # Gaussians that a thread takes at once
 

@@ -28,7 +28,8 @@ from wildgs.rasterize.cpu.simd import (
     vmax,
     vmin,
 )
-from wildgs.rasterize.cpu.simd_memory import fetch_add, prefetch, vload, vstore
+from wildgs.rasterize.cpu.simd_memory import prefetch, vload, vstore
+from wildgs.threads import fetch_add
 
 PIXELS = TILE * TILE
 # A tile's list is worked off in batches: all of a batch's Gaussians for one block,

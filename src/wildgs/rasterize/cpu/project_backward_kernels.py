@@ -15,7 +15,8 @@ from wildgs.rasterize.cpu.footprint_kernels import (
     matmul,
 )
 from wildgs.rasterize.cpu.simd import select, splat
-from wildgs.rasterize.cpu.simd_memory import fetch_add, vload, vload2, vload3, vstore3, vstore4
+from wildgs.rasterize.cpu.simd_memory import vload, vload2, vload3, vstore3, vstore4
+from wildgs.threads import fetch_add
 
 
 @njit(nogil=True, cache=True)

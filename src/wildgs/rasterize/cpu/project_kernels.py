@@ -36,15 +36,8 @@ from wildgs.rasterize.cpu.simd import (
     vmin,
     vsqrt,
 )
-from wildgs.rasterize.cpu.simd_memory import (
-    fetch_add,
-    vload,
-    vload3,
-    vstore,
-    vstore2,
-    vstore3,
-    vstore8,
-)
+from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore2, vstore3, vstore8
+from wildgs.threads import fetch_add
 
 
 @njit(nogil=True, cache=True)

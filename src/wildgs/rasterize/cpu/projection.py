@@ -14,8 +14,8 @@ from wildgs.geometry.camera import Camera
 from wildgs.rasterize.cpu import project_backward_kernels, project_kernels, tile_kernels
 from wildgs.rasterize.cpu.reach_kernels import RECORD, TILE
 from wildgs.rasterize.cpu.scratch import scratch
-from wildgs.rasterize.cpu.threads import flat, launch, run_once, thread_count
 from wildgs.rasterize.interface import Projection
+from wildgs.threads import flat, launch, run_once, thread_count
 
 GROUP = project_kernels.GROUP
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from wildgs.rasterize.cpu.simd_memory import fetch_add
+from wildgs.threads import fetch_add
 
 CHUNK = 512
 F = np.float32

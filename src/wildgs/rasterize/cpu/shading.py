@@ -11,7 +11,7 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.cpu import sh_kernels
-from wildgs.rasterize.cpu.threads import flat, launch
+from wildgs.threads import flat, launch
 
 
 class _Shade(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Loads, stores, prefetches and the atomic counter of Numba (njit) kernels that compute with `simd` vectors."""
+"""Loads, stores and prefetches of Numba (njit) kernels that compute with `simd` vectors."""
 
 from __future__ import annotations
 
@@ -132,15 +132,3 @@ def _pick(builder: ir.IRBuilder, vectors: list[ir.Value], sources: list[int]) ->
 # Rows of 2, 3, 4 or 8 floats, sixteen rows at once, as one vector per column: from (to) flat element `offset` on.
 vload2, vload3, vload4 = _columns_loader(2), _columns_loader(3), _columns_loader(4)
 vstore2, vstore3, vstore4, vstore8 = (_columns_storer(count) for count in (2, 3, 4, 8))
-
-
-@intrinsic
-def fetch_add(typingctx, array, amount):
-    """Atomically adds to element 0 of an int64 array and returns what was there: hands out work to threads."""
-
-    def codegen(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        amount = context.cast(builder, args[1], sig.args[1], types.int64)
-        return builder.atomic_rmw("add", data, amount, "monotonic")
-
-    return types.int64(array, amount), codegen

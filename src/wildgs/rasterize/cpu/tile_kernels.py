@@ -15,7 +15,8 @@ from numba import njit
 
 from wildgs.rasterize.cpu.reach_kernels import RECORD, inside_bits, window_mask
 from wildgs.rasterize.cpu.simd import lowest_bit
-from wildgs.rasterize.cpu.simd_memory import fetch_add, prefetch, prefetch_to_write
+from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write
+from wildgs.threads import fetch_add
 
 AHEAD = 16  # items between asking for what an item needs and using it
 DIGIT = 12  # bits per radix pass, so that the counts stay in the fastest cache

@@ -18,6 +18,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 from torch import Tensor
 
 from wildgs.errors import UserError
@@ -45,7 +48,7 @@ def thread_count() -> int:
 @cache
 def _pool(process: int, workers: int) -> ThreadPoolExecutor:
     """Helpers beside the calling thread; one pool a process, since threads do not survive a fork."""
-    return ThreadPoolExecutor(workers, thread_name_prefix="wildgs-raster")
+    return ThreadPoolExecutor(workers, thread_name_prefix="wildgs")
 
 
 def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = None) -> None:
@@ -98,7 +101,19 @@ def _announce() -> None:
     if not _announced.is_set():
         _announced.set()
         print(
-            "wildgs: compiling the CPU rasteriser's kernels (once; kept on disk)",
+            "wildgs: compiling the CPU kernels (once; kept on disk)",
             file=sys.stderr,
             flush=True,
         )
+
+
+@intrinsic
+def fetch_add(typingctx: Any, array: Any, amount: Any) -> Any:
+    """Atomically adds to element 0 of an int64 array and returns what was there: hands out work to threads."""
+
+    def codegen(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        amount = context.cast(builder, args[1], sig.args[1], types.int64)
+        return builder.atomic_rmw("add", data, amount, "monotonic")
+
+    return types.int64(array, amount), codegen
