@@ -24,7 +24,7 @@ INTERRUPTED = 130
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 interrupted."""
+    """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 or 143 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
@@ -39,9 +39,9 @@ def main(arguments: list[str] | None = None) -> None:
         _run(verb, rest)
     except UserError as error:
         _fail(" ".join(str(error).split()))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    except KeyboardInterrupt as interrupt:
+        print(str(interrupt) or "interrupted", file=sys.stderr)
+        sys.exit(getattr(interrupt, "code", INTERRUPTED))
 
 
 def _run(verb: str, arguments: list[str]) -> None:

@@ -11,14 +11,14 @@ from wildgs.cli.eval import evaluate_run, print_scores
 from wildgs.cli.progress import console, counting
 from wildgs.cli.sfm import print_report, reconstruct_with_progress
 from wildgs.cli.showcase import Scores, write_showcase
-from wildgs.cli.train import read_scene, train_to_end
+from wildgs.cli.train import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
 from wildgs.data.photos import SfmConfig
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
-from wildgs.runs import default_device, load_run, start_training
+from wildgs.runs import default_device, load_run
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
@@ -57,7 +57,7 @@ def run(command: Command) -> None:
         print_report(reconstruct_with_progress(command.photos, folder, command.sfm))
         estimate_depth(folder)
     config, scene = _configure(command, folder)
-    train_to_end(command.output, config, scene, start_training(command.output, config, scene))
+    train_or_go_on(command.output, config, scene)
     loaded = load_run(command.output)
     scores: Scores = {}
     if scene.test_views:

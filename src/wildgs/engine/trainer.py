@@ -12,6 +12,7 @@ from torch import Tensor
 from wildgs.data import Scene, View, scene_extent
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
+from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig
 from wildgs.errors import UserError
@@ -56,6 +57,7 @@ class StepReport:
         output: The forward pass.
         num_gaussians: N after the step.
         density: What densification did, where it ran.
+        skipped: Why the step was not taken, where its loss or gradient was no number.
         seconds: Training time so far, without what observers take.
     """
 
@@ -66,6 +68,7 @@ class StepReport:
     num_gaussians: int
     density: DensityReport | None
     seconds: float
+    skipped: str | None = None
 
 
 Observer = Callable[[StepReport], None]
@@ -101,9 +104,14 @@ class Trainer:
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
+        self.guard = StepGuard()
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
-        """Trains until `config.steps`; every observer is called after every step."""
+        """Trains until `config.steps`; every observer is called after every step.
+
+        Raises:
+            TrainingDivergedError: Too many steps in a row had no finite loss or gradient.
+        """
         if self.step == 0:
             self._prepare()
         set_precision(self.method, choose_precision(self.config.precision, self.device))
@@ -121,13 +129,19 @@ class Trainer:
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
         losses.total.backward()
-        if self.schedule.gathers(self.step):
-            self.density.gather(output.projection)
-        self.optimizers.step()
+        fault = self.guard.judge(view.name, losses, self.method.parameters())
+        if fault is None:
+            if self.schedule.gathers(self.step):
+                self.density.gather(output.projection)
+            self.optimizers.step()
+        else:
+            self.method.zero_grad(set_to_none=True)
+            self.guard.report(self.step + 1, fault, self.method)
         self.step += 1
         density = self._control_density()
         self.seconds += time.perf_counter() - start
-        return StepReport(self.step, view, losses, output, len(self.method.gaussians), density, self.seconds)
+        count = len(self.method.gaussians)
+        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault)
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -174,8 +188,12 @@ class Trainer:
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
         state |= {f"density.{name}": value for name, value in self.density.state().items()}
         state["random.generator"] = self.generator.get_state()
+        state["random.torch"] = torch.get_rng_state()
+        if self.device.type == "cuda":
+            state["random.cuda"] = torch.cuda.get_rng_state(self.device)
         state["progress.step"] = torch.tensor(self.step)
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
+        state["progress.skipped"] = torch.tensor(self.guard.skipped)
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -184,8 +202,13 @@ class Trainer:
         self.sampler.restore(_under(state, "sampler."))
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
+        if "random.torch" in state:  # files of the first version lack it
+            torch.set_rng_state(state["random.torch"])
+        if "random.cuda" in state and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["random.cuda"], self.device)
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
+        self.guard.skipped = int(state.get("progress.skipped", 0))
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
