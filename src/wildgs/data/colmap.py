@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -157,7 +158,7 @@ def _fault(image: ImageRecord, cameras: dict[int, Any]) -> str | None:
 
 
 def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
-    repeated = sorted({a for a, b in zip(names, names[1:], strict=False) if a == b})
+    repeated = sorted({a for a, b in itertools.pairwise(names) if a == b})
     if repeated:
         raise UserError(f"{folder}: the photo {repeated[0]!r} is in the COLMAP model twice; make it anew")
 
