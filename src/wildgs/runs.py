@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from wildgs.config import RunConfig, read_config, to_plain, write_config
 from wildgs.data import Alignment, Scene, load_scene
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.trainer import Trainer
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
 
@@ -123,6 +124,34 @@ def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | 
     return load_newest(folder / CHECKPOINT_FOLDER, set_aside=set_aside)
 
 
+def refuse_trained(folder: Path) -> None:
+    """Protects a run from being trained over.
+
+    Raises:
+        UserError: The folder already holds one.
+    """
+    if list_checkpoints(folder / CHECKPOINT_FOLDER):
+        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+
+
+def prepare_training(folder: Path, config: RunConfig, scene: Scene, *, resume: bool) -> Trainer:
+    """A trainer at step 0, or at the newest whole checkpoint of a run that may have a lower budget now.
+
+    Raises:
+        UserError: As `start_training` and `resume_training` do.
+    """
+    if not resume:
+        return start_training(folder, config, scene)
+    stored = read_config(folder / CONFIG_FILE)
+    if config != stored:
+        write_config(folder / CONFIG_FILE, config)
+    trainer = resume_training(folder, scene)
+    if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
+        # Saved at once, so that a run killed from here on goes on from this very state.
+        save_run(folder, trainer, config, scene.alignment)
+    return trainer
+
+
 def start_training(
     folder: Path, config: RunConfig, scene: Scene, device: torch.device | None = None
 ) -> Trainer:
@@ -131,13 +160,28 @@ def start_training(
     Raises:
         UserError: The folder already holds a trained run.
     """
-    if list_checkpoints(folder / CHECKPOINT_FOLDER):
-        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+    refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
     torch.manual_seed(config.train.seed)
-    method = create_method(config.method, config.model, scene.points, scene.point_colors)
+    points, colors = _within_budget(scene, config)
+    method = create_method(config.method, config.model, points, colors)
     return Trainer(method.to(device or default_device()), scene, config.train)
+
+
+def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """The scene's points, or a random choice of them where they are more than the budget."""
+    count, budget = len(scene.points), config.train.density.max_gaussians
+    if count <= budget:
+        return scene.points, scene.point_colors
+    warnings.warn(
+        f"the scene has {count:,} points; training starts from {budget:,} of them (--max-gaussians)",
+        WildGSWarning,
+        stacklevel=3,
+    )
+    generator = torch.Generator().manual_seed(config.train.seed)
+    chosen = torch.randperm(count, generator=generator)[:budget].sort().values
+    return scene.points[chosen], scene.point_colors[chosen]
 
 
 def resume_training(folder: Path, scene: Scene, device: torch.device | None = None) -> Trainer:

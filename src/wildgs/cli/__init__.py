@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import sys
 import warnings
 
@@ -20,6 +21,7 @@ VERBS = {
     "doctor": "what works on this machine, and how to get what does not",
 }
 USER_ERROR = 2
+logging.getLogger("wildgs").addHandler(logging.NullHandler())  # or Python prints what is logged a second time
 INTERRUPTED = 130
 
 
@@ -57,7 +59,9 @@ def _run(verb: str, arguments: list[str]) -> None:
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     """One line on stderr; other libraries' warnings are not the user's business."""
     if issubclass(category, WildGSWarning):
-        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+        line = " ".join(str(message).split())
+        logging.getLogger("wildgs").warning(line)
+        print(f"warning: {line}", file=sys.stderr)
 
 
 def _fail(message: str) -> None:

@@ -43,6 +43,8 @@ class Command:
     """Training steps."""
     downscale: float | None = None
     """Divides the photos' width and height."""
+    max_gaussians: int | None = None
+    """Most Gaussians; follows the machine unless given."""
     holdout: int = 8
     """Every n-th photo is held out for scoring; 0 = none."""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
@@ -83,7 +85,8 @@ def _configure(command: Command, folder: Path) -> tuple[RunConfig, Scene]:
     steps = command.steps or (GPU_STEPS if gpu else CPU_STEPS)
     downscale = command.downscale or _downscale_for(folder, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE)
     data = DataConfig(downscale=downscale, holdout=command.holdout)
-    budget = DensityConfig() if gpu else DensityConfig(max_gaussians=CPU_MAX_GAUSSIANS)
+    most = command.max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
+    budget = DensityConfig(max_gaussians=most)
     config = RunConfig(folder.resolve(), "wildgs", data, train=TrainConfig(steps=steps, density=budget))
     return config, read_scene(config)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,12 +11,13 @@ import torch
 from torch import Tensor
 
 from wildgs.data import Scene, View, scene_extent
+from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
 from wildgs.model.precision import Precision, choose_precision, lay_out_channels_last, set_precision
@@ -105,6 +107,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.guard = StepGuard()
+        self._unreadable: set[str] = set()
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -125,7 +128,7 @@ class Trainer:
 
     def _advance(self) -> StepReport:
         start = time.perf_counter()
-        view = self.views[self.sampler.next()]
+        view = self._next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
         losses.total.backward()
@@ -142,6 +145,27 @@ class Trainer:
         self.seconds += time.perf_counter() - start
         count = len(self.method.gaussians)
         return StepReport(self.step, view, losses, output, count, density, self.seconds, fault)
+
+    def _next_view(self) -> View:
+        """The next photo that can be read; those after it are decoded in the background meanwhile.
+
+        Raises:
+            UserError: None can be read any more.
+        """
+        for _ in range(len(self.views)):
+            view = self.views[self.sampler.next()]
+            for index in self.sampler.upcoming(AHEAD):
+                self.views[index].prefetch()
+            try:
+                view.read_photo()
+                return view
+            except UserError as error:
+                if view.name not in self._unreadable:
+                    self._unreadable.add(view.name)
+                    warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+        raise UserError(
+            f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
+        )
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -174,6 +198,11 @@ class Trainer:
         if self.schedule.resets(self.step):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         return report
+
+    def shrink_to_budget(self) -> int:
+        """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
+        budget = self.config.density.max_gaussians
+        return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
 
     def _prepare(self) -> None:
         """Shows the method a few photos, spread over the collection."""
