@@ -73,6 +73,28 @@ def test_calibration_normalises_a_fresh_encoder() -> None:
     assert 0.1 < float(features[-1].detach().std()) < 10
 
 
+def test_calibration_tells_photos_apart() -> None:
+    """Before training, embeddings spread over the photos: without it they differ in the third digit."""
+    torch.manual_seed(0)
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
+    photos = [torch.rand(64, 64, 3) * brightness for brightness in (0.2, 0.4, 0.6, 0.8, 1.0)]
+    before = torch.stack([parsing(photo)[1] for photo in photos]).detach()
+    parsing.calibrate(photos)
+    after = torch.stack([parsing(photo)[1] for photo in photos]).detach()
+    torch.testing.assert_close(after.mean(dim=0), torch.zeros(16), atol=0.05, rtol=0)
+    torch.testing.assert_close(after.std(dim=0), torch.ones(16), atol=0.05, rtol=0)
+    assert float(before.std(dim=0).max()) < 0.1
+
+
+def test_calibration_on_equal_photos_stays_finite() -> None:
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
+    photo = torch.full((64, 64, 3), 0.5)
+    parsing.calibrate([photo] * 3)
+    visibility, embedding = parsing(photo)
+    assert torch.isfinite(visibility).all()
+    assert float(embedding.detach().abs().max()) < 1000
+
+
 def test_pretrained_weights_come_from_a_folder(tmp_path: Path) -> None:
     saved = save_resnet(tmp_path, [64, 128, 256, 512])
     for norm in saved.modules():

@@ -29,7 +29,8 @@ class OptimizerConfig:
         shN: Higher harmonics (3dgs only).
         intrinsic: Intrinsic features (wildgs only).
         networks: All networks but the encoder, at the start.
-        encoder: The encoder, at the start.
+        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
+            thousand steps, and the embedding of every photo becomes the same.
         network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
     """
 
@@ -42,7 +43,7 @@ class OptimizerConfig:
     shN: float = 1.25e-4  # noqa: N815 - the field's name
     intrinsic: float = 2.5e-3
     networks: float = 1e-3
-    encoder: float = 1e-3
+    encoder: float = 1e-4
     network_decay: float = 0.1
 
 

@@ -126,6 +126,9 @@ class Trainer:
 
     def begin(self) -> None:
         """Gets the method ready for `advance`; `run` does it by itself."""
+        if self.device.type == "cpu":
+            # Adam's moments of what has no gradient decay into numbers on which processors take 100 times as long.
+            torch.set_flush_denormal(True)
         if self.step == 0:
             self._prepare()
         set_precision(self.method, choose_precision(self.config.precision, self.device))

@@ -15,6 +15,7 @@ from wildgs.model.precision import MixedModule
 from wildgs.model.unet import UpBlock
 
 CALIBRATION_SIDE = 224
+LEAST_SPREAD = 0.01
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
 
@@ -51,7 +52,9 @@ class Parsing(MixedModule):
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
         deep = FEATURE_WIDTHS[-1]
-        self.global_mlp = nn.Sequential(nn.Linear(deep, 64), nn.ReLU(), nn.Linear(64, config.global_size))
+        self.global_mlp = nn.Sequential(
+            nn.Linear(deep, 64), nn.LeakyReLU(0.1), nn.Linear(64, config.global_size)
+        )
         widths = (deep, *config.decoder_widths)
         self.decoder = nn.ModuleList(
             UpBlock(widths[level], FEATURE_WIDTHS[3 - level], widths[level + 1]) for level in range(3)
@@ -81,14 +84,28 @@ class Parsing(MixedModule):
         )
         return logits[0, 0].sigmoid(), embedding
 
+    @torch.no_grad()
     def calibrate(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
-        """Sets a fresh encoder's normalisation statistics from photos; does nothing to a pretrained one."""
+        """Starts from what tells the photos apart.
+
+        A fresh encoder gets its normalisation statistics (a pretrained one keeps its own). The first layer of
+        M^G is set so that each pooled feature enters it with mean 0 and spread 1 over the photos, and the last
+        so that Emb^g leaves it likewise: pooled features of different photos are nearly the same vector, and
+        without this many steps go by until the embedding says anything about the light.
+        """
         side = min(self.config.max_side, CALIBRATION_SIDE)
-        squares = [
-            functional.interpolate(photo.permute(2, 0, 1)[None], size=(side, side), mode="bilinear")
-            for photo in photos
-        ]
-        self.encoder.calibrate(torch.cat(squares))
+        squares = torch.cat(
+            [
+                functional.interpolate(photo.permute(2, 0, 1)[None], size=(side, side), mode="bilinear")
+                for photo in photos
+            ]
+        )
+        self.encoder.calibrate(squares)
+        if len(photos) > 1:
+            first, last = self.global_mlp[0], self.global_mlp[-1]
+            pooled = self.encoder(squares)[-1].mean(dim=(2, 3))
+            _standardize_input(first, pooled)
+            _standardize_output(last, self.global_mlp(pooled))
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
         """The photo as a batch of one, at most `max_side` long."""
@@ -99,3 +116,19 @@ class Parsing(MixedModule):
             return image
         size = (max(1, round(height * factor)), max(1, round(width * factor)))
         return functional.interpolate(image, size=size, mode="bilinear", antialias=True)
+
+
+def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"]) -> None:
+    """Makes a layer do with samples as they are what it would do with them at mean 0 and spread 1.
+
+    Features that hardly differ between the samples are not blown up to say something.
+    """
+    layer.weight.div_(samples.std(dim=0).clamp_min(LEAST_SPREAD * float(samples.abs().mean()) + 1e-8))
+    layer.bias.sub_(layer.weight @ samples.mean(dim=0))
+
+
+def _standardize_output(layer: nn.Linear, samples: Float[Tensor, "B O"]) -> None:
+    """Gives a layer's outputs, of which `samples` are examples, mean 0 and spread 1."""
+    spread = samples.std(dim=0).clamp_min(LEAST_SPREAD)
+    layer.weight.div_(spread[:, None])
+    layer.bias.sub_(samples.mean(dim=0)).div_(spread)
