@@ -26,7 +26,8 @@ class DensityConfig:
             device coordinates).
         split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
         prune_opacity: Fainter Gaussians go.
-        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
+        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before. Beyond
+            the extent it is a share of their distance from the middle: what is far may be as large.
         prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
             of them float right before a camera and stand for what stood in its way.
         reset_opacity: Opacities are lowered to this at a reset.
@@ -117,7 +118,8 @@ class DensityControl:
         splits = grows & ~clones
         prune = gaussians.opacities < self.config.prune_opacity
         if prune_large:
-            prune = prune | (largest > self.config.prune_scale * self.extent)
+            distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=-1)
+            prune = prune | (largest > self.config.prune_scale * distance.clamp_min(self.extent))
             prune = prune | (self.reach.to(prune.device) > self.config.prune_reach)
         finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)
         prune = prune | ~finite

@@ -23,6 +23,7 @@ class ScheduleConfig:
         mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
+        encoder_every: The photo's encoder learns on one step in so many (not scaled).
     """
 
     first_stage: int = 3000
@@ -32,6 +33,7 @@ class ScheduleConfig:
     reset_every: int = 3000
     mask_pause: int = 500
     sh_every: int = 1000
+    encoder_every: int = 1
 
 
 _FLOORS = {
@@ -58,6 +60,7 @@ class Schedule:
             steps: The run's own length.
         """
         self.steps = steps
+        self.encoder_every = config.encoder_every
         self._factor = steps / REFERENCE_STEPS
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
@@ -89,6 +92,7 @@ class Schedule:
             explicit=step >= self.first_stage,
             learn_mask=not self.mask_paused(step),
             sh_degree=min(step // self.sh_every, sh_degree),
+            learn_encoder=step % self.encoder_every == 0,
         )
 
     def mask_paused(self, step: int) -> bool:

@@ -14,6 +14,7 @@ from wildgs.data import Scene, View, scene_extent
 from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
+from wildgs.engine.processor import settle_on_cpu
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig
@@ -127,8 +128,7 @@ class Trainer:
     def begin(self) -> None:
         """Gets the method ready for `advance`; `run` does it by itself."""
         if self.device.type == "cpu":
-            # Adam's moments of what has no gradient decay into numbers on which processors take 100 times as long.
-            torch.set_flush_denormal(True)
+            settle_on_cpu()
         if self.step == 0:
             self._prepare()
         set_precision(self.method, choose_precision(self.config.precision, self.device))

@@ -15,6 +15,8 @@ from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
 
+ROWS_STEP = 1024
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -24,11 +26,13 @@ class Stage:
         explicit: Whether local appearance (the triplane) is on: off in the paper's first stage.
         learn_mask: Whether the visibility mask takes gradients now.
         sh_degree: Active degree of the spherical harmonics.
+        learn_encoder: Whether the photo's encoder takes gradients now.
     """
 
     explicit: bool = True
     learn_mask: bool = True
     sh_degree: int = 3
+    learn_encoder: bool = True
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,19 @@ def paint_visible(
 ) -> Float[Tensor, "N 3"]:
     """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded."""
     means = method.gaussians.means
-    rows = projection.visible.nonzero()[:, 0]
+    rows = _rounded_up(projection.visible)
     sh = method.shade(appearance, rows)
     seen = sh_to_colors(means[rows], sh, projection.camera, degree=sh_degree)
     return torch.zeros_like(means).index_copy(0, rows, seen)
+
+
+def _rounded_up(visible: Bool[Tensor, "N"]) -> Int[Tensor, " V"]:
+    """Indices of the visible Gaussians, and of a few others for a number that comes up again.
+
+    Libraries prepare, and on CPUs compile, a matrix product for every new shape.
+    """
+    rows = visible.nonzero()[:, 0]
+    missing = min(-len(rows) % ROWS_STEP, len(visible) - len(rows))
+    if missing == 0:
+        return rows
+    return torch.cat([rows, (~visible).nonzero()[:missing, 0]])

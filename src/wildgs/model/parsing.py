@@ -63,17 +63,21 @@ class Parsing(MixedModule):
         nn.init.zeros_(self.mask_head.weight)
         self.mask_head.bias.data.fill_(STATIC_BIAS)  # pyright: ignore[reportOptionalMemberAccess]
 
-    def forward(self, photo: Float[Tensor, "H W 3"]) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
+    def forward(
+        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True
+    ) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
         """Parses one photo.
 
         Args:
             photo: RGB in [0, 1].
+            learn_encoder: Whether gradients reach the encoder; all else here takes them anyway.
 
         Returns:
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
         with self.mixed(photo.device):
-            features = self.encoder(self.shrink(photo))
+            with torch.set_grad_enabled(learn_encoder and torch.is_grad_enabled()):
+                features = self.encoder(self.shrink(photo))
             x = features[-1]
             for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
                 x = block(x, skip)

@@ -18,6 +18,8 @@ from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_poin
 from wildgs.model.lifting import lift, liftable
 from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
 from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.sky import COLOR as SKY_COLOR
+from wildgs.model.sky import SkyConfig, sky_rows
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, WrappingConfig
 from wildgs.rasterize import Projection, blend
@@ -36,6 +38,7 @@ class WildGSConfig:
         parsing: 2D Parsing.
         wrapping: 3D Wrapping.
         fusion: The fusion network.
+        sky: Gaussians that stand for the sky at the start.
     """
 
     without: tuple[Ablation, ...] = ()
@@ -43,6 +46,7 @@ class WildGSConfig:
     parsing: ParsingConfig = field(default_factory=ParsingConfig)
     wrapping: WrappingConfig = field(default_factory=WrappingConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    sky: SkyConfig = field(default_factory=SkyConfig)
 
 
 class WildGS(Method):
@@ -81,11 +85,15 @@ class WildGS(Method):
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(points, config.wrapping.box_quantile, ratio)
         rows = geometry_from_points(points)
-        rows["intrinsic"] = torch.zeros(len(points), config.fusion.intrinsic_size)
+        unit_colors = colors_to_unit(colors)
+        if config.sky.points:
+            sky = sky_rows(config.sky, points)
+            rows = {name: torch.cat([values, sky[name]]) for name, values in rows.items()}
+            unit_colors = torch.cat([unit_colors, torch.full((config.sky.points, 3), SKY_COLOR)])
+        rows["intrinsic"] = torch.zeros(len(unit_colors), config.fusion.intrinsic_size)
         model = cls(config, Gaussians(rows), box, encoder)
         with torch.no_grad():
-            intrinsic = model.fusion.initial_intrinsic(colors_to_unit(colors))
-            model.gaussians.rows["intrinsic"].copy_(intrinsic)
+            model.gaussians.rows["intrinsic"].copy_(model.fusion.initial_intrinsic(unit_colors))
         return model
 
     def _lacks(self, part: Ablation) -> bool:
@@ -106,9 +114,9 @@ class WildGS(Method):
             projection = self.gaussians.project(camera)
         return self.wrap(photo, appearance, projection, keep)
 
-    def parse(self, photo: Float[Tensor, "H W 3"]) -> Appearance:
+    def parse(self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""
-        visibility, embedding = self.parsing(photo)
+        visibility, embedding = self.parsing(photo, learn_encoder=learn_encoder)
         if self._lacks("global"):
             embedding = torch.zeros_like(embedding)
         return Appearance(embedding, None, None if self._lacks("mask") else visibility)
@@ -164,7 +172,7 @@ class WildGS(Method):
         keep: Bool[Tensor, "H W"] | None = None,
     ) -> TrainingOutput:
         """The photo is its own reference; one projection serves the depth pass and the colours."""
-        appearance = self.parse(photo)
+        appearance = self.parse(photo, learn_encoder=stage.learn_encoder)
         if not stage.learn_mask and appearance.visibility is not None:
             appearance = replace(appearance, visibility=appearance.visibility.detach())
         projection = self.gaussians.project(camera)

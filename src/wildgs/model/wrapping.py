@@ -84,8 +84,7 @@ class Wrapping(MixedModule):
         if planes is None:
             return everywhere
         means = means.detach()
-        inside = self.box.contains(means).nonzero()[:, 0]
-        sampled = sample_planes(planes, self.box.normalize(means[inside]))
+        sampled = sample_planes(planes, self.box.normalize(means))
         with self.mixed(means.device):
             local = self.local_mlp(sampled)
-        return everywhere.index_copy(0, inside, local.float())
+        return torch.where(self.box.contains(means)[:, None], local.float(), everywhere)
