@@ -10,6 +10,7 @@ import torch
 from wildgs.data import Alignment, Scene, View
 from wildgs.geometry.camera import Camera
 from wildgs.model.parsing import ParsingConfig
+from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
 
@@ -19,7 +20,9 @@ SIDE = 32
 @pytest.fixture
 def tiny_model() -> WildGSConfig:
     return WildGSConfig(
-        parsing=ParsingConfig(max_side=32), wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8))
+        sky=SkyConfig(points=0),
+        parsing=ParsingConfig(max_side=32),
+        wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)),
     )
 
 

@@ -8,6 +8,7 @@ import torch
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.parsing import ParsingConfig
+from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import Ablation, WildGS, WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
 
@@ -34,6 +35,7 @@ def make_wall_model(wall: torch.Tensor):
     def make(*without: Ablation, **config: object) -> WildGS:
         torch.manual_seed(0)
         settings = WildGSConfig(
+            sky=SkyConfig(points=0),
             without=without,
             parsing=ParsingConfig(max_side=32),
             wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8), **config),  # type: ignore[arg-type]

@@ -19,7 +19,7 @@ def test_directions_are_units_above_the_lowest_elevation(count: int, lowest: flo
 
 def test_directions_are_even() -> None:
     """No direction is much further from its nearest neighbour than any other."""
-    directions = shell_directions(1000, -10)
+    directions = shell_directions(1000, -10.0)
     nearest = torch.cdist(directions, directions).fill_diagonal_(9).min(dim=1).values
     assert float(nearest.max() / nearest.min()) < 3
 
@@ -36,7 +36,7 @@ def test_shell_lies_beyond_the_points() -> None:
 def test_sky_covers_what_a_camera_sees_above_the_horizon() -> None:
     """Neighbours overlap: no direction of the sky is further than two standard deviations from a Gaussian."""
     rows = sky_rows(SkyConfig(), torch.zeros(10, 3))
-    probes = 10 * shell_directions(333, 0)
+    probes = 10 * shell_directions(333, 0.0)
     distance, nearest = torch.cdist(probes, rows["means"]).min(dim=1)
     assert bool((distance < 2 * rows["log_scales"].exp()[nearest, 0]).all())
 

@@ -12,10 +12,9 @@ from torch.nn import functional
 
 from wildgs.model.encoder import FEATURE_WIDTHS, RESNET18, Encoder, load_encoder
 from wildgs.model.precision import MixedModule
-from wildgs.model.unet import UpBlock
+from wildgs.model.unet import UpBlock, standardize_output
 
 CALIBRATION_SIDE = 224
-LEAST_SPREAD = 0.01
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
 
@@ -93,7 +92,7 @@ class Parsing(MixedModule):
         """Starts from what tells the photos apart.
 
         A fresh encoder gets its normalisation statistics (a pretrained one keeps its own). The first layer of
-        M^G is set so that each pooled feature enters it with mean 0 and spread 1 over the photos, and the last
+        M^G is set so that pooled features enter it around 0 and with a spread of 1 over the photos, and the last
         so that Emb^g leaves it likewise: pooled features of different photos are nearly the same vector, and
         without this many steps go by until the embedding says anything about the light.
         """
@@ -109,7 +108,7 @@ class Parsing(MixedModule):
             first, last = self.global_mlp[0], self.global_mlp[-1]
             pooled = self.encoder(squares)[-1].mean(dim=(2, 3))
             _standardize_input(first, pooled)
-            _standardize_output(last, self.global_mlp(pooled))
+            standardize_output(last, self.global_mlp(pooled))
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
         """The photo as a batch of one, at most `max_side` long."""
@@ -123,16 +122,12 @@ class Parsing(MixedModule):
 
 
 def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"]) -> None:
-    """Makes a layer do with samples as they are what it would do with them at mean 0 and spread 1.
+    """Makes a layer do with samples as they are what it would do with them around 0 and with spread 1 on average.
 
-    Features that hardly differ between the samples are not blown up to say something.
+    One factor for all features: what differs little between photos is mostly noise, and equal spread for every
+    feature would let the layer learn single photos by heart.
     """
-    layer.weight.div_(samples.std(dim=0).clamp_min(LEAST_SPREAD * float(samples.abs().mean()) + 1e-8))
-    layer.bias.sub_(layer.weight @ samples.mean(dim=0))
-
-
-def _standardize_output(layer: nn.Linear, samples: Float[Tensor, "B O"]) -> None:
-    """Gives a layer's outputs, of which `samples` are examples, mean 0 and spread 1."""
-    spread = samples.std(dim=0).clamp_min(LEAST_SPREAD)
-    layer.weight.div_(spread[:, None])
-    layer.bias.sub_(samples.mean(dim=0)).div_(spread)
+    mean = samples.mean(dim=0)
+    spread = (samples - mean).square().mean().sqrt()
+    layer.weight.div_(spread.clamp_min(0.01 * float(samples.abs().mean()) + 1e-8))
+    layer.bias.sub_(layer.weight @ mean)

@@ -94,6 +94,7 @@ class WildGS(Method):
         model = cls(config, Gaussians(rows), box, encoder)
         with torch.no_grad():
             model.gaussians.rows["intrinsic"].copy_(model.fusion.initial_intrinsic(unit_colors))
+        model.wrapping.calibrate(points, unit_colors[: len(points)])
         return model
 
     def _lacks(self, part: Ablation) -> bool:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from wildgs.model.precision import MixedModule
 from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_planes
-from wildgs.model.unet import UNet
+from wildgs.model.unet import UNet, standardize_output
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,19 @@ class Wrapping(MixedModule):
             pictures = pictures[:, :1]
         with self.mixed(points.device):
             return self.unet(pictures.flatten(1, 2)).float()
+
+    @torch.no_grad()
+    def calibrate(self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]) -> None:
+        """Starts with local embeddings that tell points apart: mean 0 and spread 1 over a coloured cloud.
+
+        Args:
+            points: World coordinates, the SfM points.
+            colors: RGB in [0, 1].
+        """
+        inside = self.box.contains(points)
+        if int(inside.sum()) > 1:
+            sampled = sample_planes(self.planes(points, colors), self.box.normalize(points[inside]))
+            standardize_output(self.local_mlp[-1], self.local_mlp(sampled))
 
     def local_embeddings(
         self, planes: Float[Tensor, "3 C R R"] | None, means: Float[Tensor, "N 3"]
