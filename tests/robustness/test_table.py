@@ -225,7 +225,7 @@ def test_scenes(name: str, fault: str, scene: Path, make_model) -> None:
     if kind == "used":
         assert len(views) == 6
     if kind == "left out":
-        assert len(views) == (6 if name == "depth" else 5)
+        assert len(views) == {"depth": 6}.get(name, 4 if "declares" in pattern else 5)
 
 
 @pytest.fixture

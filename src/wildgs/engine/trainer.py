@@ -156,16 +156,22 @@ class Trainer:
             view = self.views[self.sampler.next()]
             for index in self.sampler.upcoming(AHEAD):
                 self.views[index].prefetch()
-            try:
-                view.read_photo()
+            if self._is_readable(view):
                 return view
-            except UserError as error:
-                if view.name not in self._unreadable:
-                    self._unreadable.add(view.name)
-                    warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
         raise UserError(
             f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
         )
+
+    def _is_readable(self, view: View) -> bool:
+        """Whether a photo can still be read; warns once where it cannot."""
+        try:
+            view.read_photo()
+        except UserError as error:
+            if view.name not in self._unreadable:
+                self._unreadable.add(view.name)
+                warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+            return False
+        return True
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -207,7 +213,7 @@ class Trainer:
     def _prepare(self) -> None:
         """Shows the method a few photos, spread over the collection."""
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
-        chosen = self.views[::stride][:PREPARATION_PHOTOS]
+        chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self._is_readable(view)]
         self.method.prepare([view.read_photo().to(self.device).float() / 255 for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
