@@ -11,10 +11,11 @@ import torch
 
 from wildgs.data import Scene
 from wildgs.engine.autosave import Autosave, AutosaveConfig
+from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.safety import PATIENCE, TrainingDivergedError
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.model.registry import create_method
+from wildgs.model.registry import create_method, restore_method
 from wildgs.model.wildgs import WildGSConfig
 
 
@@ -193,3 +194,21 @@ def test_records_of_steps_taken_again_are_dropped(wall_scene: Scene, tmp_path: P
     with Recorder(tmp_path, step=2):
         pass
     assert lines.read_text() == '{"step": 1}\n{"step": 2}\n'
+
+
+def test_a_resumed_run_with_other_photos_draws_a_new_round(wall_scene: Scene) -> None:
+    trainer = trainer_for(wall_scene, 10)
+    trainer.run([])
+    checkpoint = Checkpoint(trainer.state(), {})
+    method = restore_method("3dgs", WildGSConfig(), checkpoint.method)
+    fewer = Trainer(method, replace(wall_scene, views=wall_scene.views[:3]), TrainConfig(steps=20))
+    with pytest.warns(WildGSWarning, match="other photos than the 3"):
+        fewer.restore(checkpoint.state)
+    names: list[str] = []
+    fewer.run([lambda report: names.append(report.view.name)])
+    assert set(names) == {"0.jpg", "1.jpg", "2.jpg"}
+
+
+def test_a_run_without_steps_is_refused() -> None:
+    with pytest.raises(UserError, match="steps 0"):
+        TrainConfig(steps=0)

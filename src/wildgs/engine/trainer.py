@@ -47,6 +47,11 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
 
+    def __post_init__(self) -> None:
+        """Refuses a run without a step."""
+        if self.steps < 1:
+            raise UserError(f"steps {self.steps}: must be 1 or more")
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -234,7 +239,9 @@ class Trainer:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Goes on from `state`; the method must have been restored from the same checkpoint already."""
         self.optimizers.restore(_under(state, "optimizer."))
-        self.sampler.restore(_under(state, "sampler."))
+        if not self.sampler.restore(_under(state, "sampler.")):
+            message = f"the run began with other photos than the {len(self.views)} that train now"
+            warnings.warn(f"{message}; it goes on with these", WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         if "random.torch" in state:  # files of the first version lack it
