@@ -62,11 +62,7 @@ TABLE: dict[str, dict[str, Cell]] = {
     "COLMAP text": _MODEL
     | {
         "empty": ("error", "holds no photo with a pose", "error"),
-        "truncated": (
-            "left out",
-            "declares 6 entries, and 4 are there",
-            "a warning, by the count in its comment",
-        ),
+        "truncated": ("error", "the COLMAP model cannot be read", "error; between two lines: a warning"),
     },
     "split .tsv": {
         "missing": ("used", "", "every 8th photo is held out"),
