@@ -132,15 +132,14 @@ def report_at(step: int) -> StepReport:
 def test_saving_by_steps_and_by_time(monkeypatch) -> None:
     now = [0.0]
     monkeypatch.setattr("wildgs.engine.autosave.time.monotonic", lambda: now[0])
-    saved: list[int] = []
-    autosave = Autosave(
-        lambda: saved.append(1), AutosaveConfig(checkpoint_every=100, checkpoint_minutes=2.0), 0
-    )
+    saved: list[float] = []
+    config = AutosaveConfig(checkpoint_every=100, checkpoint_minutes=1.0)
+    autosave = Autosave(lambda: saved.append(now[0]), config, 0)
     for step in range(1, 251):
         now[0] += 1.0  # seconds
         autosave(report_at(step))
-    assert autosave.saved_step == 220, "100, then after two minutes 220; 200 was by steps"
-    assert len(saved) == 3
+    assert saved == [60.0, 100.0, 160.0, 200.0]
+    assert autosave.saved_step == 200
 
 
 def test_a_full_disk_does_not_end_training(monkeypatch) -> None:
