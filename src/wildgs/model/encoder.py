@@ -48,7 +48,8 @@ class FrozenBatchNorm(nn.Module):
         """Scaled and shifted features."""
         if self.calibrating:
             self.running_mean.copy_(x.mean(dim=(0, 2, 3)))
-            self.running_var.copy_(x.var(dim=(0, 2, 3)))
+            # A single value (one small photo, deepest level) has no unbiased variance.
+            self.running_var.copy_(x.var(dim=(0, 2, 3), correction=min(1, x[:, 0].numel() - 1)))
         scale = self.weight * (self.running_var + self.eps).rsqrt()
         shift = self.bias - self.running_mean * scale
         return torch.addcmul(shift.to(x.dtype)[:, None, None], x, scale.to(x.dtype)[:, None, None])
@@ -134,7 +135,7 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
 
     if Path(source).is_dir():
         try:
-            resnet = ResNetModel.from_pretrained(source, local_files_only=True)
+            resnet = ResNetModel.from_pretrained(source, local_files_only=True, use_safetensors=True)
         except (OSError, ValueError, RuntimeError) as error:
             raise UserError(f"{source} does not hold a ResNet-18 in the hub's layout: {error}") from error
         if tuple(resnet.config.hidden_sizes or ()) != FEATURE_WIDTHS[1:]:
@@ -144,7 +145,7 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
         if not local and not hub_reachable():
             return None
         try:
-            return ResNetModel.from_pretrained(source, local_files_only=local)
+            return ResNetModel.from_pretrained(source, local_files_only=local, use_safetensors=True)
         except Exception:  # the hub's client raises many kinds of errors; all of them mean 'not to be had'
             continue
     return None
