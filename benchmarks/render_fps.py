@@ -3,9 +3,9 @@
     python benchmarks/render_fps.py runs/gate
 
 Frames of the same Gaussians from the same cameras, in turn: with a cached look, as `wildgs.load(RUN).render`
-draws them; and as a plain 3DGS renderer would, from stored means, quaternions, scales, opacities and harmonics. Both
-end in 8 bits. The ratio is that of the median frame times; its goal is at least 0.95. Beside it: what a new light
-costs.
+draws them; and as a plain 3DGS renderer would, from stored means, quaternions, scales, opacities and harmonics.
+Both end in 8 bits. The ratio is that of the median frame times; its goal is at least 0.95. Beside it: what a new
+light costs.
 """
 
 from __future__ import annotations

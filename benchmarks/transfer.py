@@ -8,7 +8,7 @@ Every held-out view is rendered under its own photo's light (unchanged) and unde
   Relit over unchanged is the ratio; the goal is at most 0.5 for every view. Static is what the scene's true masks
   say (`truth/masks/`), else the predicted mask.
 - The same at the source photo's own camera, pixel by pixel: mean Lab distance between the source photo and the
-  render there under its own light, over that under the view's light. No difference of framing can help or hurt here.
+  render there under its own light, over that under the view's light. Framing plays no part here.
 - Geometry: depth and alpha must be identical under both lights.
 - Mix: from 0 to 1 in steps, the pictures' mean Lab distance to the first must rise and to the last must fall, and
   no step may be much larger than the mean step.

@@ -80,7 +80,7 @@ MISTAKES = {
     "nothing to resume": (("train", "{landmark}", "--output", "{tmp}/new", "--resume"), "config.yaml"),
     "unknown photo": (
         ("render", "{trained}", "--appearance", "x.jpg", "--output", "{tmp}/o"),
-        "no photo 'x.jpg'",
+        "neither a photo",
     ),
     "no photos": (("sfm", "{tmp}", "--output", "{tmp}/scene"), "no photo"),
     "bad downscale": (("train", "{landmark}", "--output", "{tmp}/run", "--downscale", "0"), "downscale"),

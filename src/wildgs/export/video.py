@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Generator, Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +15,9 @@ from PIL import Image
 from wildgs.errors import UserError
 
 SUFFIXES = (".mp4", ".mkv", ".mov")
+OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
+"""Endings by which someone asks for a file that is not written here, not for a folder."""
+
 CRF = 18
 """x264's constant quality: 18 is hard to tell from the frames."""
 
@@ -32,7 +35,7 @@ def check_output(path: Path) -> None:
     Raises:
         UserError: The name is of a video that cannot be written, or what a video needs is not installed.
     """
-    if path.suffix and not is_video(path):
+    if path.suffix.lower() in OTHER_MEDIA:
         known = ", ".join(SUFFIXES)
         raise UserError(f"{path}: videos end in {known}; a name without an ending makes a folder of PNGs")
     if is_video(path):
@@ -110,7 +113,7 @@ def _write_folder(path: Path, frames: Frames) -> None:
 
 
 @contextmanager
-def _aside(path: Path) -> Generator[Path]:
+def _aside(path: Path) -> Iterator[Path]:
     """A hidden folder on the same disk, gone afterwards whatever happens."""
     folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.part."))
     try:
