@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from PIL import Image
 
 import wildgs
 from wildgs.cli.showcase import different_lights
@@ -48,7 +49,7 @@ class Command:
     output: Path | None = None
     """JSON file for all figures."""
     pictures: Path | None = None
-    """Folder for sheets of views under the sources' light and of mixes."""
+    """Folder for sheets: views under the sources' light, mixes, a picture's style."""
 
 
 def to_lab(picture: np.ndarray) -> np.ndarray:
@@ -179,6 +180,33 @@ def draw(scene: wildgs.LoadedScene, views: Sequence[View], sources: Sequence[Vie
     contact_sheet(mixes, ["0", "0.25", "0.5", "0.75", "1"], tile=size).save(folder / "mix.png")
 
 
+def style_picture(width: int = 480, height: int = 360, seed: int = 3) -> np.ndarray:
+    """A painting of no place: patches of orange over violet, lit from the left, with brush strokes."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:height, 0:width] / height
+    seeds = rng.uniform(0, 1, (60, 2)) * [1, width / height]
+    nearest = ((y[..., None] - seeds[:, 0]) ** 2 + (x[..., None] - seeds[:, 1]) ** 2).argmin(axis=-1)
+    warm = rng.uniform(0, 1, 60)[nearest] * 0.4 + 0.6 * (y + 0.15 * np.sin(9 * x))
+    violet, orange = np.array([70, 40, 130.0]), np.array([250, 150, 50.0])
+    strokes = 1 + 0.12 * np.sin(60 * (x + 0.6 * y) + 7 * np.sin(5 * y))
+    light = 1.15 - 0.35 * x[..., None] * height / width
+    color = (violet + np.clip(warm, 0, 1)[..., None] * (orange - violet)) * strokes[..., None] * light
+    return np.clip(color, 0, 255).astype(np.uint8)
+
+
+def draw_style(scene: wildgs.LoadedScene, views: Sequence[View], folder: Path) -> None:
+    """Views under the light of a picture that shows no place."""
+    file = folder / "style.png"
+    Image.fromarray(style_picture()).save(file)
+    look = scene.appearance(file, like="auto")
+    print(f"style: {look.note}")
+    own = [scene.render(view.camera, scene.appearance(view.name)).numpy() for view in views]
+    styled = [scene.render(view.camera, look).numpy() for view in views]
+    rows = [[style_picture(), *own], [None, *styled]]
+    captions = ["the picture", *(view.name for view in views)]
+    contact_sheet(rows, captions, tile=(240, 180)).save(folder / "styled.png")
+
+
 def main(command: Command) -> None:
     scene = wildgs.load(command.run)
     views = list(scene.scene.test_views)
@@ -204,6 +232,7 @@ def main(command: Command) -> None:
         command.output.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     if command.pictures is not None:
         draw(scene, views[:SHOWN], sources, command.pictures)
+        draw_style(scene, views[:3], command.pictures)
 
 
 if __name__ == "__main__":
