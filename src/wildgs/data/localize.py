@@ -25,8 +25,8 @@ from wildgs.data.undistort import PixelGrid, sample_colors
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 
-MIN_INLIERS = 20
-"""Fewer points that agree with a pose may do so by chance."""
+MIN_INLIERS = 15
+"""Fewer points that agree with a pose may do so by chance: photos of other places reach 5."""
 
 MATCH_RATIO = 0.85
 MAX_ERROR = 0.008
