@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -18,8 +19,13 @@ SUFFIXES = (".mp4", ".mkv", ".mov")
 OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
 """Endings by which someone asks for a file that is not written here, not for a folder."""
 
-CRF = 18
-"""x264's constant quality: 18 is hard to tell from the frames."""
+ENCODING: dict[str, Any] = {
+    "codec": "libx264",
+    "quality": None,
+    "macro_block_size": 2,
+    "output_params": ["-crf", "18", "-movflags", "+faststart"],
+}
+"""H.264 that plays everywhere, at a quality that is hard to tell from the frames."""
 
 Frames = Iterable[UInt8[np.ndarray, "H W 3"]]
 
@@ -44,7 +50,7 @@ def check_output(path: Path) -> None:
         _ffmpeg()
 
 
-def _ffmpeg():
+def _ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError as error:
@@ -79,15 +85,7 @@ def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
         raise UserError(f"{size[0]} x {size[1]}: a video's width and height must be even numbers")
     with _aside(path) as folder:
         part = folder / path.name
-        writer = _ffmpeg().write_frames(
-            str(part),
-            size,
-            fps=fps,
-            codec="libx264",
-            quality=None,
-            macro_block_size=2,
-            output_params=["-crf", str(CRF), "-movflags", "+faststart"],
-        )
+        writer = _ffmpeg().write_frames(str(part), size, fps=fps, **ENCODING)
         try:
             writer.send(None)
             for frame in frames:
