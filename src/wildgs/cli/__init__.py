@@ -16,7 +16,9 @@ VERBS = {
     "sfm": "camera poses of a folder of photos, with pycolmap",
     "train": "a scene with poses -> a trained run",
     "eval": "score a run on its held-out photos",
-    "render": "pictures of a run's views under the light of any of its photos",
+    "render": "pictures and videos of a run in the light of any photo",
+    "gallery": "views x appearances of a run as one picture",
+    "appearance": "the light of a photo, or a mix of several, as a small file",
     "depth": "fill a scene's depth/ with Depth Anything V2",
     "doctor": "what works on this machine, and how to get what does not",
 }
