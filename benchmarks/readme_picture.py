@@ -13,10 +13,10 @@ import torch
 import tyro
 from PIL import Image
 
-from wildgs.cli.render import encode_view, find_view
 from wildgs.cli.showcase import different_lights
 from wildgs.data import View
 from wildgs.evaluation.metrics import to_8bit
+from wildgs.light.photos import encode_view, find_view
 from wildgs.model.method import Method
 from wildgs.runs import load_run
 

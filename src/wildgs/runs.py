@@ -46,9 +46,9 @@ class Run:
     train_seconds: float
     alignment: Alignment
 
-    def load_scene(self, progress: Callable[[int, int], None] | None = None) -> Scene:
-        """The scene on which the run was trained."""
-        return load_scene(self.config.scene, self.config.data, progress=progress)
+    def load_scene(self, progress: Callable[[int, int], None] | None = None, *, lazy: bool = False) -> Scene:
+        """The scene on which the run was trained; `lazy` decodes photos only when they are asked for."""
+        return load_scene(self.config.scene, self.config.data, lazy=lazy, progress=progress)
 
 
 def load_run(folder: Path, device: torch.device | None = None) -> Run:

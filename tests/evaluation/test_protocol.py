@@ -32,7 +32,7 @@ class Painter(Method):
         self.shown: list[tuple[torch.Tensor, Camera]] = []
         self.keeps: list[torch.Tensor | None] = []
 
-    def encode(self, photo, camera, keep=None):
+    def encode(self, photo, camera, keep=None, *, trust_mask=True):
         assert not self.training
         assert not torch.is_grad_enabled()
         self.shown.append((photo, camera))

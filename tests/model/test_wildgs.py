@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from wildgs.model.appearance import Appearance, mix
+from wildgs.model.appearance import Appearance, blend_embeddings
 from wildgs.model.lifting import lift, liftable
 from wildgs.model.method import Stage
 from wildgs.model.registry import create_method, restore_method
@@ -146,10 +146,10 @@ def test_mix_is_linear_on_both_embeddings(camera, make_wall_model) -> None:
     model = make_wall_model()
     with torch.no_grad():
         a, b = (model.embed(model.encode(photo_of(camera, v), camera)) for v in (1.0, 0.1))
-    middle = mix(a, b, 0.25)
+    middle = blend_embeddings([a, b], [0.75, 0.25])
     torch.testing.assert_close(middle.global_embedding, 0.75 * a.global_embedding + 0.25 * b.global_embedding)
     torch.testing.assert_close(middle.local_embeddings, 0.75 * a.local_embeddings + 0.25 * b.local_embeddings)
-    assert torch.equal(mix(a, b, 0.0).local_embeddings, a.local_embeddings)
+    assert torch.equal(blend_embeddings([a, b], [1.0, 0.0]).local_embeddings, a.local_embeddings)
 
 
 @pytest.mark.parametrize("part", ["global", "mask", "intrinsic", "local", "reverse", "crop"])

@@ -9,12 +9,9 @@ import torch
 import tyro
 
 from wildgs.cli.progress import console, counting
-from wildgs.data import Scene, View
-from wildgs.errors import UserError
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.pictures import picture_paths, write_picture
-from wildgs.model.appearance import Appearance
-from wildgs.model.method import Method
+from wildgs.light.photos import encode_view, find_view
 from wildgs.runs import load_run
 
 
@@ -53,24 +50,3 @@ def run(command: Command) -> None:
                 write_picture(folder / paths[view.name], to_8bit(colors))
                 progress(number * len(views) + index + 1, len(views) * len(lights))
     console.print(f"{len(views) * len(lights)} pictures -> {command.output}")
-
-
-def find_view(scene: Scene, name: str) -> View:
-    """A view by its photo's name, or its name without the ending.
-
-    Raises:
-        UserError: The scene has no such photo.
-    """
-    for view in scene.views:
-        if name in (view.name, str(Path(view.name).with_suffix(""))):
-            return view
-    raise UserError(f"{scene.root} has no photo {name!r} with a camera; names are as in its images/ folder")
-
-
-def encode_view(method: Method, view: View) -> Appearance:
-    """The appearance of one of the scene's own photos."""
-    device = method.gaussians.means.device
-    photo = view.read_photo().to(device).float() / 255
-    mask = view.read_mask()
-    keep = None if mask is None else mask.to(device) > 0
-    return method.encode(photo, view.camera.to(device), keep)

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wildgs.cli.render import encode_view
 from wildgs.data import Scene, View
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.protocol import Protocol
 from wildgs.export.report import MethodScores, Report, ReportExample, write_report
+from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import Run
 

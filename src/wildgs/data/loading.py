@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
@@ -14,7 +15,7 @@ from wildgs.data.alignment import align_world
 from wildgs.data.colmap import ColmapImage, describe_names, read_model
 from wildgs.data.images import MAX_IMAGE_PIXELS, UnreadableImageError
 from wildgs.data.phototourism import assign_splits
-from wildgs.data.pictures import PhotoFiles
+from wildgs.data.pictures import PhotoFiles, Pictures
 from wildgs.data.scene import Alignment, Scene, Split, View
 from wildgs.data.undistort import PixelGrid
 from wildgs.errors import UserError, WildGSWarning
@@ -22,6 +23,9 @@ from wildgs.geometry.camera import Camera
 
 DECODERS = 4
 """Threads that decode photos; Pillow works without Python's lock."""
+
+KEPT_PICTURES = 8
+"""Photos that a lazily read scene keeps decoded."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,11 @@ class DataConfig:
 
 
 def load_scene(
-    root: Path, config: DataConfig | None = None, *, progress: Callable[[int, int], None] | None = None
+    root: Path,
+    config: DataConfig | None = None,
+    *,
+    lazy: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Read a COLMAP scene: cameras, points, split, photos (decoded once, kept as 8 bits), masks, depth.
 
@@ -56,6 +64,8 @@ def load_scene(
         root: Folder with `images/` and `sparse/0/` (or `sparse/`, `dense/sparse/`), optionally a `*.tsv`
             split, `masks/`, `depth/` and `truth/`.
         config: Size, split and limits; the defaults where None.
+        lazy: Decode photos only when they are asked for, and keep the last few: for tools that look at some of
+            them. A photo that cannot be read is then no reason to leave its view out.
         progress: Called with (photos read, photos in all) as photos are decoded.
 
     Returns:
@@ -74,7 +84,14 @@ def load_scene(
         [image.median_depth for image in model.images if image.median_depth is not None],
     )
     chosen = [image for image in model.images if image.name in splits]
-    views, broken = _load_views(chosen, splits, alignment, model.images_dir, root, config, progress)
+    load_view = partial(
+        _lazy_view if lazy else _load_view,
+        alignment=alignment,
+        images_dir=model.images_dir,
+        root=root,
+        config=config,
+    )
+    views, broken = _load_views(chosen, splits, load_view, progress)
     _report_broken(broken, views, model.images_dir)
     return Scene(
         root=root,
@@ -93,10 +110,7 @@ def _unit_camera(image: ColmapImage) -> Camera:
 def _load_views(
     chosen: Sequence[ColmapImage],
     splits: dict[str, Split],
-    alignment: Alignment,
-    images_dir: Path,
-    root: Path,
-    config: DataConfig,
+    load_view: Callable[[ColmapImage, Split], View],
     progress: Callable[[int, int], None] | None,
 ) -> tuple[list[View], list[tuple[str, str]]]:
     """Views in the order of their names, and (name, reason) of the photos that cannot be read."""
@@ -105,7 +119,7 @@ def _load_views(
 
     def load(image: ColmapImage) -> View | str:
         try:
-            return _load_view(image, splits[image.name], alignment, images_dir, root, config)
+            return load_view(image, splits[image.name])
         except UnreadableImageError as error:
             return str(error)
 
@@ -126,15 +140,11 @@ def _load_views(
 def _load_view(
     image: ColmapImage, split: Split, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
 ) -> View:
-    if image.camera.is_spherical():
-        raise UserError(f"{image.name}: spherical cameras ({image.camera.model_name}) are not supported")
-    grid = PixelGrid.from_colmap(image.camera, config.downscale)
-    camera = alignment.apply_camera(Camera(image.viewmat, grid.K, grid.width, grid.height))
-    files = PhotoFiles(root, images_dir, image.name, grid, config.max_image_pixels)
+    camera, files = _place(image, alignment, images_dir, root, config)
     pictures = files.load(use_mask=config.use_masks, use_depth=config.use_depth)
     return View(
         name=image.name,
-        camera=replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float()),
+        camera=camera,
         split=split,
         read_photo=pictures.read_photo,
         read_mask=pictures.read_mask,
@@ -142,6 +152,50 @@ def _load_view(
         read_clean=files.read_clean,
         read_truth_mask=files.read_truth_mask,
     )
+
+
+def _lazy_view(
+    image: ColmapImage, split: Split, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
+) -> View:
+    camera, files = _place(image, alignment, images_dir, root, config)
+    later = _LaterPictures(files, config)
+    return View(
+        name=image.name,
+        camera=camera,
+        split=split,
+        read_photo=lambda: _decode(later).read_photo(),
+        read_mask=lambda: _decode(later).read_mask(),
+        read_disparity=lambda: _decode(later).read_disparity(),
+        read_clean=files.read_clean,
+        read_truth_mask=files.read_truth_mask,
+    )
+
+
+class _LaterPictures:
+    """A photo that is not decoded yet; known to the cache by identity."""
+
+    def __init__(self, files: PhotoFiles, config: DataConfig) -> None:
+        self.files, self.config = files, config
+
+
+@lru_cache(maxsize=KEPT_PICTURES)
+def _decode(later: _LaterPictures) -> Pictures:
+    try:
+        return later.files.load(use_mask=later.config.use_masks, use_depth=later.config.use_depth)
+    except UnreadableImageError as error:
+        raise UserError(f"{later.files.photo}: {error}; mend the file or choose another photo") from error
+
+
+def _place(
+    image: ColmapImage, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
+) -> tuple[Camera, PhotoFiles]:
+    """The photo's camera in the aligned frame, and where its files are."""
+    if image.camera.is_spherical():
+        raise UserError(f"{image.name}: spherical cameras ({image.camera.model_name}) are not supported")
+    grid = PixelGrid.from_colmap(image.camera, config.downscale)
+    camera = alignment.apply_camera(Camera(image.viewmat, grid.K, grid.width, grid.height))
+    files = PhotoFiles(root, images_dir, image.name, grid, config.max_image_pixels)
+    return replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float()), files
 
 
 def _report_broken(broken: Sequence[tuple[str, str]], views: Sequence[View], images_dir: Path) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -37,16 +38,27 @@ class Embeddings:
     local_embeddings: Float[Tensor, "N L"]
 
 
-def mix(first: Embeddings, second: Embeddings, amount: float) -> Embeddings:
-    """Tuning: (1 - a) f_1 + a f_2 on global and local embeddings (paper, appendix Video Demo).
+def blend_embeddings(
+    parts: Sequence[Embeddings], weights: Sequence[float], local_weights: Sequence[float] | None = None
+) -> Embeddings:
+    """Tuning: Σ w_k f_k on global and local embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
 
     Args:
-        first: Embeddings at amount 0.
-        second: Embeddings at amount 1, for the same Gaussians.
-        amount: a in [0, 1]; values outside extrapolate.
+        parts: Embeddings for the same Gaussians, at least one.
+        weights: One for each part.
+        local_weights: Weights of the local embeddings where they differ.
     """
-    values: dict[str, Any] = {
-        name: (1 - amount) * getattr(first, name) + amount * getattr(second, name)
-        for name in ("global_embedding", "local_embeddings")
-    }
-    return Embeddings(**values)
+    local_weights = weights if local_weights is None else local_weights
+    return Embeddings(
+        _weighted([part.global_embedding for part in parts], weights),
+        _weighted([part.local_embeddings for part in parts], local_weights),
+    )
+
+
+def _weighted(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
+    """Σ w x; what has weight 0 is not looked at."""
+    chosen = [(value, weight) for value, weight in zip(values, weights, strict=True) if weight != 0]
+    total = chosen[0][0] * chosen[0][1]
+    for value, weight in chosen[1:]:
+        total = torch.add(total, value, alpha=weight)
+    return total

@@ -71,7 +71,12 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def encode(
-        self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        trust_mask: bool = True,
     ) -> Appearance:
         """Reads the appearance of a photo.
 
@@ -79,6 +84,8 @@ class Method(nn.Module, ABC):
             photo: RGB in [0, 1].
             camera: Its camera, of the photo's size.
             keep: The user's own mask: pixels that are False are not lifted.
+            trust_mask: Whether pixels that the method takes for transient are left out too. Not for pictures that
+                are no photo of the place: there is nobody in the way, and everything is unusual.
         """
 
     @abstractmethod

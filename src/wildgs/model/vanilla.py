@@ -30,7 +30,12 @@ class VanillaGS(Method):
         return cls(Gaussians(rows))
 
     def encode(
-        self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        trust_mask: bool = True,
     ) -> Appearance:
         """Nothing: this method knows one light only."""
         return Appearance()

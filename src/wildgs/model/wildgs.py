@@ -96,10 +96,17 @@ class WildGS(Method):
         self.parsing.calibrate(photos)
 
     def encode(
-        self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None = None
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        trust_mask: bool = True,
     ) -> Appearance:
         """Parses the photo, lifts its static pixels by the rendered depth, and builds the triplane."""
         appearance = self.parse(photo)
+        if not trust_mask:
+            appearance = replace(appearance, visibility=None)
         if self._lacks("local"):
             return appearance
         with torch.no_grad():

@@ -1,0 +1,114 @@
+"""A look: one light on the whole scene, shaded once and then as cheap as plain 3D Gaussian Splatting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wildgs.errors import UserError
+from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings
+from wildgs.model.method import Method
+from wildgs.model.wildgs import WildGS
+
+NEUTRAL = "neutral"
+"""The name of the mean light."""
+
+SUM_TOLERANCE = 1e-3
+"""How far from one the weights of a mix may add up: rounded weights on a command line are no mistake."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The appearance of a whole scene, from a photo, a picture, a file or a mix of those.
+
+    Attributes:
+        name: For people and for file names.
+        embeddings: What `mix` mixes; None for a method that has one light only (plain 3DGS).
+        method: The trained method to which the embeddings belong.
+    """
+
+    name: str
+    embeddings: Embeddings | None = field(repr=False)
+    method: Method = field(repr=False)
+
+    @cached_property
+    def sh(self) -> Float[Tensor, "N K 3"]:
+        """Spherical harmonics of all Gaussians under this light, on the method's device; shaded once, then kept."""
+        with torch.no_grad():
+            if self.embeddings is None:
+                return self.method.shade(Appearance())
+            if not isinstance(self.method, WildGS):
+                raise TypeError(f"a {type(self.method).__name__} cannot be lit by embeddings")
+            return self.method.fuse(self.embeddings)
+
+
+@torch.no_grad()
+def look_of(method: Method, appearance: Appearance, name: str) -> Look:
+    """The look of an encoded photo."""
+    if not isinstance(method, WildGS):
+        return Look(name, None, method)
+    return Look(name, method.embed(appearance), method)
+
+
+def own_look(method: Method) -> Look:
+    """The one look of a method without appearance."""
+    return Look("own light", None, method)
+
+
+def mix(
+    looks: Sequence[Look],
+    weights: Sequence[float],
+    *,
+    local_weights: Sequence[float] | None = None,
+    name: str | None = None,
+) -> Look:
+    """Tuning: a look between others (paper, appendix Video Demo), at the cost of one shading, no encoding.
+
+    Args:
+        looks: Any number of looks of one scene.
+        weights: One for each, adding up to one. Negative ones extrapolate.
+        local_weights: For the local embeddings (shadows, lamps, what lies where), where they shall be mixed in
+            other parts than the global one (colour and brightness of it all).
+        name: Of the new look; None describes the mix.
+
+    Raises:
+        UserError: The weights do not fit the looks or do not add up to one, or the looks are of different scenes.
+    """
+    if not looks:
+        raise UserError("a mix needs at least one appearance")
+    first = looks[0]
+    if any(look.method is not first.method for look in looks):
+        raise UserError("these appearances belong to different scenes; mix those of one loaded scene")
+    weights = _checked(looks, weights)
+    local = weights if local_weights is None else _checked(looks, local_weights)
+    if first.embeddings is None:
+        return first
+    parts = [look.embeddings for look in looks if look.embeddings is not None]
+    name = name or _describe(looks, weights, local)
+    return Look(name, blend_embeddings(parts, weights, local), first.method)
+
+
+def _checked(looks: Sequence[Look], weights: Sequence[float]) -> list[float]:
+    """The weights as they were given, but for rounding: scaled to add up to one exactly."""
+    if len(weights) != len(looks):
+        raise UserError(f"{len(looks)} appearances need {len(looks)} weights, not {len(weights)}")
+    total = float(sum(weights))
+    if not abs(total - 1) <= SUM_TOLERANCE:
+        raise UserError(f"the weights of a mix must add up to 1, these add up to {total:g}")
+    return [float(weight) / total for weight in weights]
+
+
+def _describe(looks: Sequence[Look], weights: Sequence[float], local: Sequence[float]) -> str:
+    def sum_of(parts: Sequence[float]) -> str:
+        return " + ".join(
+            look.name if weight == 1 else f"{weight:.3g} {look.name}"
+            for look, weight in zip(looks, parts, strict=True)
+            if weight != 0
+        )
+
+    return sum_of(weights) if weights == local else f"global {sum_of(weights)}, local {sum_of(local)}"

@@ -1,0 +1,82 @@
+"""The light of photos whose camera is known, and of pictures that borrow one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from PIL import Image
+from torch import Tensor
+
+from wildgs.data import Scene, View
+from wildgs.errors import UserError
+from wildgs.geometry.camera import Camera
+from wildgs.model.appearance import Appearance
+from wildgs.model.method import Method
+
+
+def match_view(views: Sequence[View], name: str) -> View | None:
+    """The view of a photo by its name, or its name without the ending; None where there is none."""
+    for view in views:
+        if name in (view.name, str(Path(view.name).with_suffix(""))):
+            return view
+    return None
+
+
+def find_view(scene: Scene, name: str) -> View:
+    """The view of a photo by its name, or its name without the ending.
+
+    Raises:
+        UserError: The scene has no such photo.
+    """
+    view = match_view(scene.views, name)
+    if view is None:
+        raise UserError(
+            f"{scene.root} has no photo {name!r} with a camera; names are as in its images/ folder"
+        )
+    return view
+
+
+@torch.no_grad()
+def encode_view(method: Method, view: View) -> Appearance:
+    """The appearance of one of the scene's own photos."""
+    device = method.gaussians.means.device
+    mask = view.read_mask()
+    keep = None if mask is None else mask.to(device) > 0
+    return method.encode(_unit(view.read_photo(), device), view.camera.to(device), keep)
+
+
+@torch.no_grad()
+def encode_photo(method: Method, photo: UInt8[Tensor, "H W 3"], camera: Camera) -> Appearance:
+    """The appearance of a photo of the place, seen by a camera in the scene's aligned frame."""
+    device = method.gaussians.means.device
+    return method.encode(_unit(photo, device), camera.to(device))
+
+
+@torch.no_grad()
+def encode_picture(method: Method, picture: UInt8[Tensor, "h w 3"], camera: Camera) -> Appearance:
+    """The appearance of any picture, as if the camera had seen it: style transfer (paper, appendix).
+
+    The picture is cut to the camera's shape about its middle. All of it is lifted: what a mask, learnt from photos
+    of the place, takes for a passer-by in a painting means nothing.
+    """
+    device = method.gaussians.means.device
+    fitted = cover(picture, camera.width, camera.height)
+    return method.encode(_unit(fitted, device), camera.to(device), trust_mask=False)
+
+
+def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "H W 3"]:
+    """The picture scaled and cut about its middle so that it fills a frame; nothing is stretched."""
+    image = Image.fromarray(picture.numpy())
+    scale = max(width / image.width, height / image.height)
+    part = (width / scale, height / scale)
+    left, top = (image.width - part[0]) / 2, (image.height - part[1]) / 2
+    box = (max(left, 0), max(top, 0), min(left + part[0], image.width), min(top + part[1], image.height))
+    fitted = image.resize((width, height), Image.Resampling.LANCZOS, box=box)
+    return torch.frombuffer(bytearray(fitted.tobytes()), dtype=torch.uint8).reshape(height, width, 3)
+
+
+def _unit(photo: UInt8[Tensor, "H W 3"], device: torch.device) -> Tensor:
+    return photo.to(device).float() / 255

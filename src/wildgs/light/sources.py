@@ -1,0 +1,133 @@
+"""Where appearance can come from: a photo of the scene, a new one, any picture, the mean, or a file."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from wildgs.data import Scene, View
+from wildgs.data.images import UnreadableImageError, read_photo
+from wildgs.errors import UserError
+from wildgs.light.atlas import Atlas, make_atlas
+from wildgs.light.look import NEUTRAL, Look, look_of, own_look
+from wildgs.light.photos import encode_picture, encode_view, find_view, match_view
+from wildgs.light.saved import SUFFIX, load_look
+from wildgs.model.method import Method
+from wildgs.model.wildgs import WildGS
+
+AUTO = "auto"
+"""As `like`: the training photo whose global embedding is nearest."""
+
+KEPT_LOOKS = 16
+"""Looks that are kept with their shaded harmonics, the last used."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and of how much."""
+
+
+class LightSources:
+    """Finds the looks of one scene by what a user writes, and keeps the last few."""
+
+    def __init__(self, method: Method, open_scene: Callable[[], Scene]) -> None:
+        """Sets up `LightSources`.
+
+        Args:
+            method: The trained method.
+            open_scene: Reads the scene when it is first needed: a saved appearance needs none.
+        """
+        self.method = method
+        self._open_scene = open_scene
+        self._kept: OrderedDict[tuple[str, str | None], Look] = OrderedDict()
+        self._atlas: Atlas | None = None
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene with its photos."""
+        return self._open_scene()
+
+    def find(self, spec: str | Path, *, like: str | None = None, progress: Progress | None = None) -> Look:
+        """The look that a user asks for.
+
+        In this order: `neutral`; a saved appearance (`*.safetensors`); a photo of the scene by its name, with or
+        without its ending; a file of a photo or picture.
+
+        Args:
+            spec: One of the above.
+            like: For a file: the photo of the scene whose camera and depth it borrows, or `auto` for the training
+                photo that looks most like it.
+            progress: Told about long work.
+
+        Raises:
+            UserError: There is no such photo or file, or it cannot be read.
+        """
+        if not isinstance(self.method, WildGS):
+            return own_look(self.method)
+        key = (str(spec), like)
+        if key not in self._kept:
+            self._kept[key] = self._make(self.method, str(spec), like, progress or _silent)
+        self._kept.move_to_end(key)
+        while len(self._kept) > KEPT_LOOKS:
+            self._kept.popitem(last=False)
+        return self._kept[key]
+
+    def _make(self, method: WildGS, spec: str, like: str | None, progress: Progress) -> Look:
+        if spec == NEUTRAL:
+            return Look(NEUTRAL, self.atlas(progress).mean, method)
+        if spec.endswith(SUFFIX):
+            return load_look(method, Path(spec))
+        view = match_view(self.scene.views, spec)
+        if view is not None:
+            return look_of(method, encode_view(method, view), view.name)
+        file = Path(spec)
+        if not file.is_file():
+            raise UserError(
+                f"{spec}: is neither a photo of {self.scene.root} (names are as in its images/ folder), nor a file,"
+                f" nor {NEUTRAL!r}"
+            )
+        return self._borrow(method, file, like or AUTO, progress)
+
+    def _borrow(self, method: WildGS, file: Path, like: str, progress: Progress) -> Look:
+        """The look of any picture, through the camera of a photo of the scene."""
+        picture = read_picture(file)
+        lender = find_view(self.scene, like) if like != AUTO else self._most_alike(method, picture, progress)
+        return look_of(method, encode_picture(method, picture, lender.camera), file.stem)
+
+    def _most_alike(self, method: WildGS, picture: UInt8[Tensor, "H W 3"], progress: Progress) -> View:
+        atlas = self.atlas(progress)
+        appearance = encode_picture(method, picture, atlas.views[0].camera)
+        assert appearance.global_embedding is not None
+        return atlas.most_alike(appearance.global_embedding)
+
+    def atlas(self, progress: Progress | None = None) -> Atlas:
+        """The light of all training photos; made once."""
+        if self._atlas is None:
+            assert isinstance(self.method, WildGS)
+            tell = progress or _silent
+            self._atlas = make_atlas(
+                self.method,
+                self.scene.train_views,
+                lambda done, total: tell("reading the light of the photos", done, total),
+            )
+        return self._atlas
+
+
+def read_picture(file: Path) -> UInt8[Tensor, "H W 3"]:
+    """A picture file, upright.
+
+    Raises:
+        UserError: It cannot be read.
+    """
+    try:
+        return torch.from_numpy(read_photo(file).pixels)
+    except UnreadableImageError as error:
+        raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
+
+
+def _silent(*_: object) -> None:
+    """No one is told."""
