@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -13,10 +14,11 @@ from wildgs.cli.progress import TrainingProgress, console, counting
 from wildgs.config import RunConfig, read_config
 from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.engine.recorder import Recorder
-from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.engine.trainer import Observer, TrainConfig, Trainer
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import CONFIG_FILE, resume_training, save_run, start_training
+from wildgs.viewer.server import ServerConfig
 
 CHECKPOINT_EVERY = 1000
 
@@ -39,6 +41,9 @@ class Command:
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    view: bool = False
+    """Show training in the browser, and stay there when it is done. Takes at most 5% of the time."""
+    server: ServerConfig = field(default_factory=ServerConfig)
 
 
 def run(command: Command) -> None:
@@ -51,7 +56,24 @@ def run(command: Command) -> None:
         trainer = resume_training(command.output, scene)
     else:
         trainer = start_training(command.output, config, scene)
-    train_to_end(command.output, config, scene, trainer)
+    if command.view:
+        _train_in_view(command, config, scene, trainer)
+    else:
+        train_to_end(command.output, config, scene, trainer)
+
+
+def _train_in_view(command: Command, config: RunConfig, scene: Scene, trainer: Trainer) -> None:
+    from wildgs.cli.view import stay, watch_training
+
+    viewer, turns = watch_training(trainer, scene, command.server, command.output.resolve().name)
+    try:
+        train_to_end(command.output, config, scene, trainer, [turns])
+    except BaseException:
+        viewer.close()
+        raise
+    console.print("the viewer stays open (Ctrl-C ends it)")
+    viewer.ask_for_update()
+    stay(viewer)
 
 
 def read_scene(config: RunConfig) -> Scene:
@@ -65,7 +87,9 @@ def read_scene(config: RunConfig) -> Scene:
     return scene
 
 
-def train_to_end(folder: Path, config: RunConfig, scene: Scene, trainer: Trainer) -> None:
+def train_to_end(
+    folder: Path, config: RunConfig, scene: Scene, trainer: Trainer, observers: Sequence[Observer] = ()
+) -> None:
     """Trains what is left, recording and saving; an interrupt saves first."""
     label = f"training {config.method}"
     saved = trainer.step
@@ -82,7 +106,12 @@ def train_to_end(folder: Path, config: RunConfig, scene: Scene, trainer: Trainer
     ):
         try:
             trainer.run(
-                [recorder, progress, lambda report: save() if report.step % CHECKPOINT_EVERY == 0 else None]
+                [
+                    recorder,
+                    progress,
+                    lambda report: save() if report.step % CHECKPOINT_EVERY == 0 else None,
+                    *observers,
+                ]
             )
         finally:
             save()

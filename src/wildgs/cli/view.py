@@ -10,10 +10,13 @@ import tyro
 
 from wildgs.api import load
 from wildgs.cli.progress import console
+from wildgs.data import Scene
+from wildgs.engine.trainer import StepReport, Trainer
 from wildgs.errors import UserError
 from wildgs.viewer.jobs import start_worker
 from wildgs.viewer.server import ServerConfig, address, open_server
-from wildgs.viewer.subject import Subject
+from wildgs.viewer.subject import Subject, TrainingSubject
+from wildgs.viewer.training import TrainingTurns
 from wildgs.viewer.viewer import Viewer, ViewerConfig
 
 
@@ -35,9 +38,8 @@ class Command:
 def run(command: Command) -> None:
     """Serves the page until interrupted."""
     viewer = open_viewer(command)
-    start_worker(viewer.jobs)
     console.print(f"{command.run}: {address(viewer.server, command.server)}  (Ctrl-C ends it)")
-    wait_for_interrupt(viewer)
+    stay(viewer)
 
 
 def open_viewer(command: Command) -> Viewer:
@@ -59,11 +61,40 @@ def open_viewer(command: Command) -> Viewer:
         raise
 
 
-def wait_for_interrupt(viewer: Viewer) -> None:
-    """Keeps the program alive until Ctrl-C."""
+def stay(viewer: Viewer) -> None:
+    """Serves a page whose subject does not change any more, until Ctrl-C."""
+    start_worker(viewer.jobs)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
         console.print("closed")
     finally:
         viewer.close()
+
+
+def watch_training(
+    trainer: Trainer, scene: Scene, server_config: ServerConfig, title: str
+) -> tuple[Viewer, TrainingTurns]:
+    """A page on a training run, and the observer that keeps it up to date.
+
+    Raises:
+        UserError: There is no viser, or no such address.
+    """
+    server = open_server(server_config, title)
+    try:
+        viewer = Viewer(server, TrainingSubject(trainer, scene), ViewerConfig(), status="training starts")
+    except BaseException:
+        server.stop()
+        raise
+
+    def update(report: StepReport) -> None:
+        viewer.set_status(
+            f"step {report.step:,} of {trainer.config.steps:,}, {report.num_gaussians:,} Gaussians"
+        )
+        viewer.ask_for_update()
+
+    def watched() -> bool:
+        return bool(server.get_clients())
+
+    console.print(f"viewer: {address(server, server_config)}")
+    return viewer, TrainingTurns(viewer.jobs, watched, update)

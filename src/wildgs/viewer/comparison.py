@@ -58,7 +58,9 @@ def compare(subject: Subject, view: View, look: Look) -> Comparison:
         name=view.name,
         photo=photo.numpy(),
         render=render.numpy(),
-        mask=None if visibility is None else tint_hidden(photo.numpy(), _resized_mask(visibility, width, height)),
+        mask=None
+        if visibility is None
+        else tint_hidden(photo.numpy(), _resized_mask(visibility, width, height)),
         depth=color_depth(depth.double().cpu().numpy()),
         psnr=psnr(render, photo),
         light=look.name,
@@ -79,5 +81,7 @@ def _resized(photo: UInt8[Tensor, "H W 3"], width: int, height: int) -> UInt8[Te
 
 
 def _resized_mask(mask: Float[Tensor, "H W"], width: int, height: int) -> Float[np.ndarray, "h w"]:
-    small = torch.nn.functional.interpolate(mask[None, None], (height, width), mode="bilinear", antialias=True)
+    small = torch.nn.functional.interpolate(
+        mask[None, None], (height, width), mode="bilinear", antialias=True
+    )
     return small[0, 0].numpy()

@@ -39,35 +39,31 @@ class SplatDisplay:
         self._subject = subject
         self._splats: Splats | None = None
         self._handle: viser.GaussianSplatHandle | None = None
-        self._look: Look | None = None
+        self._sh: Float[Tensor, "M K 3"] | None = None
+        self._version: int | None = None
 
+    @torch.no_grad()
     def show(self, look: Look) -> None:
-        """Draws all Gaussians under a light; looks at their geometry anew only where it is another model's state."""
-        if self._splats is None:
+        """Draws all Gaussians under a light of the subject's present state."""
+        if self._splats is None or self._version != self._subject.version:
+            self._version = self._subject.version
             self._splats = splats_of(self._subject.method.gaussians)
-        self._look = look
+        self._sh = look.sh[self._splats.rows]
         self.repaint()
 
-    def forget_geometry(self) -> None:
-        """Takes the Gaussians anew at the next `show`: they have been trained on."""
-        self._splats = None
-        self._look = None
-
     def repaint(self) -> None:
-        """Evaluates colours for the eye and sends them."""
-        if self._splats is None or self._look is None:
+        """Evaluates colours for the eye and sends them; the subject may have changed since `show`."""
+        if self._splats is None or self._sh is None:
             return
-        colors = self._colors(self._splats, self._look)
+        colors = self._colors(self._splats, self._sh)
         arguments = as_viser(self._splats, colors)
         if self._handle is None:
             self._handle = self._server.scene.add_gaussian_splats(NODE, **arguments, scale=1 / ENLARGED)
         else:
             self._handle.set_gaussians(**arguments)
 
-    def _colors(self, splats: Splats, look: Look) -> Float[np.ndarray, "M 3"]:
+    def _colors(self, splats: Splats, sh: Float[Tensor, "M K 3"]) -> Float[np.ndarray, "M 3"]:
         if self.paint == "depth":
             distances = distances_from(splats.means, self.eye)
             return color_depth(distances[None].astype(np.float64))[0] / 255
-        with torch.no_grad():
-            sh = look.sh[splats.rows]
         return colors_from(splats.means, sh, self.eye, self._subject.sh_degree)

@@ -101,7 +101,9 @@ class LightPanel:
         self._number = 0
         self.touched = False
         gui = server.gui
-        self._side = gui.add_button_group("Photo goes", SIDES, hint="Which end of the slider a photo is given to")
+        self._side = gui.add_button_group(
+            "Photo goes", SIDES, hint="Which end of the slider a photo is given to"
+        )
         self._sheet = gui.add_html("")
         self._buttons = {name: self._add_button(name) for name in gallery.names}
         self._slider = gui.add_slider("Mix", 0.0, 1.0, 0.01, desk.amount)
@@ -109,7 +111,9 @@ class LightPanel:
         self._upload = gui.add_upload_button("A picture of your own", mime_type="image/*")
         gui.add_html(drop_zone(element_id(self._upload)))
         self._slider.on_update(lambda _: self.set_amount(self._slider.value))
-        self._upload.on_upload(lambda _: self.take_picture(self._upload.value.name, self._upload.value.content))
+        self._upload.on_upload(
+            lambda _: self.take_picture(self._upload.value.name, self._upload.value.content)
+        )
         gallery.on_change(self.refresh)
         self.refresh()
 
@@ -158,7 +162,8 @@ class LightPanel:
         """Draws the thumbnails that there are, and which are chosen."""
         desk = self.desk
         thumbnails = [
-            Thumbnail(name, source, element_id(self._buttons[name])) for name, source in self._gallery.sources()
+            Thumbnail(name, source, element_id(self._buttons[name]))
+            for name, source in self._gallery.sources()
         ]
         self._sheet.content = contact_sheet(thumbnails, (desk.first.label, desk.second.label))
         self._pair.content = light_pair(desk.first.label, desk.second.label, desk.amount)
@@ -185,5 +190,3 @@ def store_upload(folder: Path, number: int, name: str, content: bytes) -> Path:
 def most_different(colors: dict[str, np.ndarray], start: str) -> str:
     """The photo whose mean colour is farthest from another's."""
     return max(colors, key=lambda name: float(np.linalg.norm(colors[name] - colors[start])))
-
-

@@ -52,7 +52,9 @@ class PhotoPanel:
         self._choice = gui.add_dropdown("Go to photo", (NO_PHOTO, *self._by_name), initial_value=NO_PHOTO)
         self._choice.on_update(self._chosen)
         self.own_light = gui.add_checkbox(
-            "Under its own light", True, hint="Otherwise the render is under the light that the scene is shown in"
+            "Under its own light",
+            True,
+            hint="Otherwise the render is under the light that the scene is shown in",
         )
         self.own_light.on_update(lambda _: self._revisit())
         self._pictures = gui.add_html(

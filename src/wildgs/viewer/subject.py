@@ -53,8 +53,10 @@ class Subject:
         """Where the method is."""
         return self.method.gaussians.means.device
 
-    def refresh(self) -> None:
-        """Looks anew at what may have changed; a trained method does not."""
+    @property
+    def version(self) -> int:
+        """Grows whenever the method has changed: what was computed before fits no longer."""
+        return 0
 
     def look(self, spec: str | Path, like: str | None = None) -> Look:
         """The light of a photo by name, or of any picture file, which borrows the camera of the photo `like`.
@@ -96,16 +98,26 @@ class TrainingSubject(Subject):
         super().__init__(trainer.method, scene)
         self._trainer = trainer
         self._explicit = True
-        self.refresh()
+        self._step = -1
+        self._catch_up()
 
-    def refresh(self) -> None:
-        """Forgets looks of earlier steps, and takes over the stage of training."""
-        stage = self._trainer.schedule.stage(self._trainer.step, self.method.sh_degree)
+    @property
+    def version(self) -> int:
+        """The number of steps done."""
+        return self._trainer.step
+
+    def _catch_up(self) -> None:
+        """Forgets looks of earlier steps, which may have had other Gaussians, and takes over the stage."""
+        if self._step == self._trainer.step:
+            return
+        self._step = self._trainer.step
+        stage = self._trainer.schedule.stage(self._step, self.method.sh_degree)
         self.sh_degree, self._explicit = stage.sh_degree, stage.explicit
         self._sources = LightSources(self.method, lambda: self.scene)
 
     def look(self, spec: str | Path, like: str | None = None) -> Look:
         """As `Subject.look`; without local light as long as training is without it."""
+        self._catch_up()
         with self._inference():
             if self._explicit or not isinstance(self.method, WildGS):
                 return super().look(spec, like)

@@ -11,7 +11,7 @@ from wildgs.viewer.jobs import Jobs
 SHARE = 0.03
 """Part of the time that the viewer may take. It promises 5% at most; the rest covers what viser's own thread needs
 to send what was made here."""
-SNAPSHOT_SECONDS = 3.0
+UPDATE_SECONDS = 3.0
 
 
 class TrainingTurns:
@@ -26,10 +26,10 @@ class TrainingTurns:
         self,
         jobs: Jobs,
         watched: Callable[[], bool],
-        snapshot: Callable[[], None],
+        update: Callable[[StepReport], None],
         *,
         share: float = SHARE,
-        every: float = SNAPSHOT_SECONDS,
+        every: float = UPDATE_SECONDS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Sets up `TrainingTurns`.
@@ -37,24 +37,24 @@ class TrainingTurns:
         Args:
             jobs: Work that was asked for.
             watched: Whether any browser is connected.
-            snapshot: Asks for the picture of the present step.
+            update: Asks for the present step to be shown.
             share: Part of the time that work may take.
-            every: Seconds between snapshots, at least.
+            every: Seconds between updates, at least.
             clock: Seconds.
         """
         self.seconds = 0.0
-        self._jobs, self._watched, self._snapshot = jobs, watched, snapshot
+        self._jobs, self._watched, self._update = jobs, watched, update
         self._share, self._every, self._clock = share, every, clock
-        self._rest_until = self._next_snapshot = clock()
+        self._rest_until = self._next_update = clock()
 
     def __call__(self, report: StepReport) -> None:
         """Does one piece of work, if its time has come."""
         now = self._clock()
         if now < self._rest_until or not self._watched():
             return
-        if now >= self._next_snapshot:
-            self._next_snapshot = now + self._every
-            self._snapshot()
+        if now >= self._next_update:
+            self._next_update = now + self._every
+            self._update(report)
         job = self._jobs.take(wait=False)
         if job is None:
             return

@@ -18,7 +18,6 @@ import torch
 
 from wildgs.data import View
 from wildgs.errors import UserError
-from wildgs.light.look import Look
 from wildgs.model.gaussians import NEAR
 from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.comparison import compare
@@ -76,7 +75,6 @@ class Viewer:
         self.jobs = Jobs()
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
-        self._shown: Look | None = None
         self.gallery = Gallery(spread(subject.views, config.photos))
         start = _overview(subject.views)
         self._set_start(start)
@@ -146,9 +144,11 @@ class Viewer:
     def _visited(self, view: View) -> None:
         self._ask("compare", self._compare)
 
-    def ask_for_snapshot(self) -> None:
-        """Has the subject's present state shown: its Gaussians, and its light encoded anew."""
-        self._ask("light", self._take_snapshot)
+    def ask_for_update(self) -> None:
+        """Has the subject's present state shown: its Gaussians, its light encoded anew, the photo in question."""
+        self._ask("light", self._relight)
+        if self.photos.current is not None:
+            self._ask("compare", self._compare)
 
     def set_status(self, text: str) -> None:
         """Shows a line about the subject."""
@@ -175,24 +175,15 @@ class Viewer:
             self.complain(f"{type(error).__name__} in the viewer; its log says where")
 
     def _relight(self) -> None:
-        look = self.lighting.desk.look(self.subject)
-        self._shown = look
-        self.display.show(look)
+        self.display.show(self.lighting.desk.look(self.subject))
         if self.photos.current is not None and not self.photos.own_light.value:
-            self._ask("compare", self._compare)
-
-    def _take_snapshot(self) -> None:
-        self.subject.refresh()
-        self.display.forget_geometry()
-        self._relight()
-        if self.photos.current is not None:
             self._ask("compare", self._compare)
 
     def _compare(self) -> None:
         view = self.photos.current
         if view is not None:
-            own = self.photos.own_light.value or self._shown is None
-            look = self.subject.look(view.name) if own or self._shown is None else self._shown
+            own = self.photos.own_light.value
+            look = self.subject.look(view.name) if own else self.lighting.desk.look(self.subject)
             self.photos.show(compare(self.subject, view, look))
 
     def _load_thumbnails(self) -> None:
