@@ -63,13 +63,14 @@ def open_viewer(command: Command) -> Viewer:
 
 def stay(viewer: Viewer) -> None:
     """Serves a page whose subject does not change any more, until Ctrl-C."""
-    start_worker(viewer.jobs)
+    worker = start_worker(viewer.jobs)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
         console.print("closed")
     finally:
         viewer.close()
+        worker.join()
 
 
 def watch_training(

@@ -54,7 +54,11 @@ def work_off(jobs: Jobs) -> None:
 
 
 def start_worker(jobs: Jobs) -> threading.Thread:
-    """Works off the queue on a thread of its own, which ends with the queue or the program."""
-    worker = threading.Thread(target=work_off, args=(jobs,), name="wildgs-viewer", daemon=True)
+    """Works off the queue on a thread of its own.
+
+    It ends when the queue is closed and the job in hand is done. A program must wait for that: a thread that Python
+    stops in the middle of a kernel takes the whole process with it.
+    """
+    worker = threading.Thread(target=work_off, args=(jobs,), name="wildgs-viewer")
     worker.start()
     return worker
