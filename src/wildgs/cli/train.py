@@ -72,6 +72,7 @@ def _train_in_view(command: Command, config: RunConfig, scene: Scene, trainer: T
         viewer.close()
         raise
     console.print("the viewer stays open (Ctrl-C ends it)")
+    viewer.set_status(f"trained {trainer.step:,} steps, {len(trainer.method.gaussians):,} Gaussians")
     viewer.ask_for_update()
     stay(viewer)
 

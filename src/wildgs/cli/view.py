@@ -19,6 +19,8 @@ from wildgs.viewer.subject import Subject, TrainingSubject
 from wildgs.viewer.training import TrainingTurns
 from wildgs.viewer.viewer import Viewer, ViewerConfig
 
+VIDEO_FOLDER = "videos"
+
 
 @dataclass(frozen=True)
 class Command:
@@ -55,7 +57,7 @@ def open_viewer(command: Command) -> Viewer:
         scene = load(command.run)
         subject = Subject(scene.run.method, scene.scene)
         status = f"step {scene.run.step:,}, {len(scene.gaussians):,} Gaussians"
-        return Viewer(server, subject, command.viewer, command.appearance, status)
+        return Viewer(server, subject, command.viewer, command.appearance, status, command.run / VIDEO_FOLDER)
     except BaseException:
         server.stop()
         raise

@@ -18,13 +18,24 @@ class ViserCamera(Protocol):
     """What is read of `viser.CameraHandle`; axes are OpenCV's, as ours."""
 
     @property
-    def wxyz(self) -> np.ndarray: ...
+    def wxyz(self) -> np.ndarray:
+        """Camera-to-world rotation."""
+        ...
+
     @property
-    def position(self) -> np.ndarray: ...
+    def position(self) -> np.ndarray:
+        """The camera's centre."""
+        ...
+
     @property
-    def fov(self) -> float: ...
+    def fov(self) -> float:
+        """Vertical field of view, radians."""
+        ...
+
     @property
-    def aspect(self) -> float: ...
+    def aspect(self) -> float:
+        """Width over height."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,7 @@ def pose_of(camera: Camera) -> Pose:
 
 
 def camera_of(camera: ViserCamera, height: int, aspect: float | None = None) -> Camera:
-    """viser's camera as ours, on a picture of a given height.
+    """A camera of viser's as ours, on a picture of a given height.
 
     Args:
         camera: A client's camera, or a `Pose`.

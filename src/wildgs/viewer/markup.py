@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
@@ -103,8 +102,8 @@ def light_pair(first: str, second: str, amount: float) -> str:
     left, right = names
     return (
         '<div style="display:flex;justify-content:space-between;gap:12px;font-size:12px;margin:0 12px 6px">'
-        f"<div>{left} {100 * (1 - amount):.0f}%</div><div style='text-align:right'>{right} {100 * amount:.0f}%</div>"
-        "</div>"
+        f"<div>{left} {100 * (1 - amount):.0f}%</div>"
+        f'<div style="text-align:right">{right} {100 * amount:.0f}%</div></div>'
     )
 
 

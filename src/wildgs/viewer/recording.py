@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,17 +41,27 @@ class VideoOrder:
 
 
 class RecordingPanel:
-    """The controls of a path, and its views as frustums in the scene."""
+    """The controls of a path, and its views as frustums in the scene.
 
-    def __init__(self, server: viser.ViserServer, folder: Path | None, ordered: Callable[[], None]) -> None:
+    Attributes:
+        folder: Where videos go.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        folder: Path | None,
+        ordered: Callable[[viser.ClientHandle | None], None],
+    ) -> None:
         """Adds the controls to the container that is open.
 
         Args:
             server: The viewer's.
             folder: Where videos go; None while there can be none (training).
-            ordered: Called, on a thread of viser's, when someone wants the video.
+            ordered: Called, on a thread of viser's, with the browser that wants the video.
         """
-        self._server, self._folder, self._ordered = server, folder, ordered
+        self.folder = folder
+        self._server, self._ordered = server, ordered
         self._poses: list[Pose] = []
         self._markers: list[viser.CameraFrustumHandle] = []
         gui = server.gui
@@ -67,7 +76,7 @@ class RecordingPanel:
             "Light goes from left to right", False, hint="Otherwise it stays as it is shown"
         )
         self._make = gui.add_button("Make the video", disabled=folder is None)
-        self._make.on_click(lambda _: self._ordered())
+        self._make.on_click(lambda event: self._ordered(event.client))
         self._line = gui.add_html("")
         self.tell(self._describe())
 
@@ -114,7 +123,7 @@ class RecordingPanel:
         )
 
     def _describe(self) -> str:
-        if self._folder is None:
+        if self.folder is None:
             return "Videos can be made once training is done: open the run with wildgs view."
         count = len(self._poses)
         if count < LEAST_VIEWS:

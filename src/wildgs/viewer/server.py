@@ -84,7 +84,7 @@ def _import_viser():
 
 
 def _check_address(config: ServerConfig) -> None:
-    """viser goes on to the next port for ever where an address can never be listened on."""
+    """Refuses what viser would try on one port after the other, for ever."""
     if not 0 <= config.port <= 65535:
         raise UserError(f"--port {config.port}: ports are 0 to 65535, and 0 takes any free one")
     try:

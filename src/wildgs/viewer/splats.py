@@ -17,9 +17,9 @@ from wildgs.rasterize import sh_to_colors
 from wildgs.rasterize.interface import MIN_ALPHA
 
 ENLARGED = 10.0
-"""viser holds covariances in half precision, whose numbers are coarse below 6e-5. The aligned frame's unit is the
-photos' usual depth, and a Gaussian as wide as a pixel there has a variance of 1e-6. Splats are handed over this much
-larger, and their scene node shrinks them again."""
+"""Covariances go to the browser in half precision, whose numbers are coarse below 6e-5. The aligned frame's unit is
+the photos' usual depth, and a Gaussian as wide as a pixel there has a variance of 1e-6. Splats are handed over this
+much larger, and their scene node shrinks them again."""
 
 _HALF_MAX = 6e4
 

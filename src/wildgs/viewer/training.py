@@ -18,8 +18,8 @@ class TrainingTurns:
     """An observer of training that does the viewer's work between steps, and rests after it.
 
     Parameters may only be read between steps, so the work is done on the trainer's thread. Work that took t seconds
-    is followed by a rest of t (1 - share) / share, so its part of the time never grows beyond the share, however much
-    the people at the screen ask for; they wait longer instead.
+    is followed by a rest of t (1 - share) / share, so its part of the time never grows beyond the share, however
+    much the people at the screen ask for; they wait longer instead.
     """
 
     def __init__(

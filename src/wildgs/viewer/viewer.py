@@ -22,11 +22,13 @@ from wildgs.model.gaussians import NEAR
 from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.comparison import compare
 from wildgs.viewer.display import Paint, SplatDisplay
+from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.gallery import Gallery, spread
 from wildgs.viewer.jobs import Job, Jobs
 from wildgs.viewer.lighting import Light, LightDesk, LightPanel, most_different
 from wildgs.viewer.markup import escape
 from wildgs.viewer.photos import PhotoPanel
+from wildgs.viewer.recording import RecordingPanel
 from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ class Viewer:
         config: ViewerConfig,
         lights: Sequence[str] = (),
         status: str = "",
+        videos: Path | None = None,
     ) -> None:
         """Builds the page.
 
@@ -70,21 +73,23 @@ class Viewer:
             config: How.
             lights: Up to two specs of lights to begin with; the rest is chosen from the photos.
             status: A line about the subject.
+            videos: Where videos go; None where none can be made (training).
         """
         self.server, self.subject = server, subject
         self.jobs = Jobs()
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
+        self._closing = threading.Event()
         self.gallery = Gallery(spread(subject.views, config.photos))
         start = _overview(subject.views)
         self._set_start(start)
         self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
-        self._build(lights, status)
+        self._build(lights, status, videos)
         server.on_client_connect(self._greet)
         self._ask("light", self._relight)
         self._ask("gallery", self._load_thumbnails)
 
-    def _build(self, lights: Sequence[str], status: str) -> None:
+    def _build(self, lights: Sequence[str], status: str, videos: Path | None) -> None:
         gui = self.server.gui
         self._status = gui.add_html("")
         self.set_status(status)
@@ -98,7 +103,8 @@ class Viewer:
             self.lighting.touched = bool(lights)
         with tabs.add_tab("Photos"):
             self.photos = PhotoPanel(self.server, self.subject.views, self.gallery, self._visited)
-        self.tabs = tabs
+        with tabs.add_tab("Path"):
+            self.recording = RecordingPanel(self.server, videos, self._film_ordered)
 
     def _first_desk(self, lights: Sequence[str]) -> LightDesk:
         names = self.gallery.names
@@ -144,6 +150,9 @@ class Viewer:
     def _visited(self, view: View) -> None:
         self._ask("compare", self._compare)
 
+    def _film_ordered(self, client: viser.ClientHandle | None) -> None:
+        self._ask("film", lambda: self._film(client))
+
     def ask_for_update(self) -> None:
         """Has the subject's present state shown: its Gaussians, its light encoded anew, the photo in question."""
         self._ask("light", self._relight)
@@ -186,6 +195,26 @@ class Viewer:
             look = self.subject.look(view.name) if own else self.lighting.desk.look(self.subject)
             self.photos.show(compare(self.subject, view, look))
 
+    def _film(self, client: viser.ClientHandle | None) -> None:
+        panel = self.recording
+        if panel.folder is None:
+            return
+        order = panel.order()
+
+        def told(done: int, total: int) -> bool:
+            if done % 5 == 0 or done == total:
+                panel.tell(f"frame {done} of {total}")
+            return not self._closing.is_set()
+
+        try:
+            file = make_film(self.subject, self.lighting.desk, order, free_name(panel.folder), told)
+        except Exception:
+            panel.tell("there is no video")
+            raise
+        panel.tell(f"written: {file}")
+        if client is not None:
+            client.send_file_download(file.name, file.read_bytes())
+
     def _load_thumbnails(self) -> None:
         if self.gallery.load_some():
             self._ask("gallery", self._load_thumbnails)
@@ -195,6 +224,7 @@ class Viewer:
 
     def close(self) -> None:
         """Ends the work and the server."""
+        self._closing.set()
         self.jobs.close()
         with self._lock:
             if self._timer is not None:
