@@ -58,7 +58,6 @@ def test_page_draws_what_the_rasteriser_draws(
     page = browse(address(viewer.server, ServerConfig()))
     wait_for(viewer.server.get_clients)
     wait_for(lambda: len(viewer.gallery.sources()) == len(subject.views))
-    viewer.photos._parent.visible = False
     viewer.display.eye = subject.views[0].camera.position
     pictures = {}
     for amount in (0.0, 1.0):

@@ -18,7 +18,7 @@ from wildgs.engine.trainer import Observer, TrainConfig, Trainer
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import CONFIG_FILE, resume_training, save_run, start_training
-from wildgs.viewer.server import ServerConfig
+from wildgs.viewer.server import ServerConfig, import_viser
 
 CHECKPOINT_EVERY = 1000
 
@@ -51,6 +51,8 @@ def run(command: Command) -> None:
     config = RunConfig(command.scene.resolve(), command.method, command.data, command.model, command.train)
     if command.resume:
         config = replace(read_config(command.output / CONFIG_FILE), scene=config.scene)
+    if command.view:
+        import_viser()  # a mistake is told before photos are read
     scene = read_scene(config)
     if command.resume:
         trainer = resume_training(command.output, scene)

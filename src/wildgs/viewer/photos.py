@@ -46,9 +46,12 @@ class PhotoPanel:
         self.current: View | None = None
         self._frustums: dict[str, viser.CameraFrustumHandle] = {}
         gui = server.gui
-        self._parent = server.scene.add_frame(PARENT, show_axes=False)
-        shown = gui.add_checkbox("Cameras", True, hint="Where the photos were taken; a click goes there")
-        shown.on_update(lambda _: setattr(self._parent, "visible", shown.value))
+        # Not shown at first: at a photo's viewpoint, the photos of others stand in the way.
+        self.parent = server.scene.add_frame(PARENT, show_axes=False, visible=False)
+        shown = gui.add_checkbox(
+            "Show cameras", False, hint="Where photos were taken; a click on one goes there"
+        )
+        shown.on_update(lambda _: setattr(self.parent, "visible", shown.value))
         self._choice = gui.add_dropdown("Go to photo", (NO_PHOTO, *self._by_name), initial_value=NO_PHOTO)
         self._choice.on_update(self._chosen)
         self.own_light = gui.add_checkbox(
@@ -58,8 +61,8 @@ class PhotoPanel:
         )
         self.own_light.on_update(lambda _: self._revisit())
         self._pictures = gui.add_html(
-            '<div style="font-size:12px;opacity:.75;margin:2px 12px 8px">A click on a camera in the scene goes '
-            "to where a photo was taken, and shows photo, render, mask and depth here.</div>"
+            '<div style="font-size:12px;opacity:.75;margin:2px 12px 8px">Choose a photo above, or click its camera '
+            "in the scene, to stand where it was taken. Photo, render, mask and depth appear here.</div>"
         )
         gallery.on_change(self.refresh)
         self.refresh()

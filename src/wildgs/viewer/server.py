@@ -46,7 +46,7 @@ def open_server(config: ServerConfig, title: str) -> viser.ViserServer:
     Raises:
         UserError: viser is not installed, the address is none of this machine's, or sharing failed.
     """
-    viser = _import_viser()
+    viser = import_viser()
     _check_address(config)
 
     class Server(viser.ViserServer):
@@ -74,7 +74,12 @@ def address(server: viser.ViserServer, config: ServerConfig) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
-def _import_viser():
+def import_viser():
+    """The library, which is an extra.
+
+    Raises:
+        UserError: It is not installed; the message says how to get it.
+    """
     try:
         return importlib.import_module("viser")
     except ModuleNotFoundError as error:

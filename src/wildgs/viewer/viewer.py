@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from wildgs.data import View
+from wildgs.data import Scene, View
 from wildgs.errors import UserError
+from wildgs.geometry.lens import focus
 from wildgs.model.gaussians import NEAR
 from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.comparison import compare
@@ -81,8 +82,8 @@ class Viewer:
         self._timer: threading.Timer | None = None
         self._closing = threading.Event()
         self.gallery = Gallery(spread(subject.views, config.photos))
-        start = _overview(subject.views)
-        self._set_start(start)
+        start, distance = overview(subject.scene)
+        self._set_start(start, distance)
         self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
         self._build(lights, status, videos)
         server.on_client_connect(self._greet)
@@ -112,10 +113,10 @@ class Viewer:
         first, second = (chosen * 2)[:2]
         return LightDesk(Light(first, Path(first).name), Light(second, Path(second).name))
 
-    def _set_start(self, view: View) -> None:
+    def _set_start(self, view: View, distance: float) -> None:
         pose, camera = pose_of(view.camera), self.server.initial_camera
         camera.position = pose.position
-        camera.look_at = pose.position + view.camera.forward.double().cpu().numpy()
+        camera.look_at = pose.position + distance * view.camera.forward.double().cpu().numpy()
         camera.up = np.array([0.0, 0.0, 1.0])
         camera.fov, camera.near, camera.far = pose.fov, NEAR, FAR
 
@@ -233,7 +234,22 @@ class Viewer:
         self.server.stop()
 
 
-def _overview(views: Sequence[View]) -> View:
-    """The photo that was taken nearest to where most were."""
-    positions = torch.stack([view.camera.position for view in views])
-    return views[int((positions - positions.median(dim=0).values).norm(dim=1).argmin())]
+def overview(scene: Scene) -> tuple[View, float]:
+    """A photo that shows the landmark from afar, and how far away that is: where flying begins.
+
+    Of the photos taken from beyond the usual distance it is the one that looks most straight at what all look at.
+    """
+    target = torch.from_numpy(
+        focus([view.camera for view in scene.views], scene.points.median(dim=0).values.double().numpy())
+    ).float()
+    ahead = [target - view.camera.position.cpu() for view in scene.views]
+    distances = torch.stack([offset.norm() for offset in ahead])
+    cosines = torch.stack(
+        [
+            view.camera.forward.cpu() @ offset / offset.norm().clamp_min(1e-6)
+            for view, offset in zip(scene.views, ahead, strict=True)
+        ]
+    )
+    far = (distances >= distances.median()) & (distances <= distances.quantile(0.9))
+    best = int(torch.where(far, cosines, cosines - 2).argmax())
+    return scene.views[best], max(float(distances[best]), 10 * NEAR)
