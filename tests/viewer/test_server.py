@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 from collections.abc import Iterator
+from unittest.mock import Mock
 
 import pytest
 
@@ -79,9 +80,7 @@ def test_without_viser_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_address_is_one_to_type() -> None:
-    class Fake:
-        def get_port(self) -> int:
-            return 81
-
+    server = Mock(spec=viser.ViserServer)
+    server.get_port.return_value = 81
     for host, expected in (("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1"), ("::1", "[::1]")):
-        assert address(Fake(), ServerConfig(host=host)) == f"http://{expected}:81"  # type: ignore[arg-type]
+        assert address(server, ServerConfig(host=host)) == f"http://{expected}:81"

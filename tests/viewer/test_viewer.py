@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ import torch
 
 from wildgs.data import Scene
 from wildgs.engine.trainer import Trainer
+from wildgs.viewer.cameras import Pose
 from wildgs.viewer.server import ServerConfig, open_server
 from wildgs.viewer.splats import colors_from
 from wildgs.viewer.subject import Subject, TrainingSubject
@@ -36,6 +36,10 @@ def viewer(subject: Subject) -> Iterator[Viewer]:
     work_off(viewer)
     yield viewer
     viewer.close()
+
+
+def standing_at(place: np.ndarray) -> Pose:
+    return Pose(np.array([1.0, 0, 0, 0]), place.astype(float), 1.0, 1.5)
 
 
 def colors(viewer: Viewer) -> np.ndarray:
@@ -90,10 +94,10 @@ def test_colours_follow_the_camera_s_place_but_not_its_turn(
     monkeypatch.setattr("wildgs.viewer.viewer.REPAINT_SECONDS", 0.0)
     monkeypatch.setattr(viewer, "_repaint_soon", lambda: asked.append(True))
     place = viewer.display.eye.numpy()
-    viewer._camera_moved(cast("Any", SimpleNamespace(position=place)))
+    viewer._camera_moved(standing_at(place))
     assert asked == []
     before = colors(viewer)
-    viewer._camera_moved(cast("Any", SimpleNamespace(position=place + [0.5, 0.2, 0.0])))
+    viewer._camera_moved(standing_at(place + [0.5, 0.2, 0.0]))
     assert viewer._timer is not None
     viewer._timer.join(20)
     assert asked == [True]

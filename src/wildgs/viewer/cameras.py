@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from wildgs.geometry.camera import Camera
 
 
+@runtime_checkable
 class ViserCamera(Protocol):
     """What is read of `viser.CameraHandle`; axes are OpenCV's, as ours."""
 

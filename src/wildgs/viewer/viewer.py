@@ -20,7 +20,7 @@ from wildgs.data import Scene, View
 from wildgs.errors import UserError
 from wildgs.geometry.lens import focus
 from wildgs.model.gaussians import NEAR
-from wildgs.viewer.cameras import pose_of
+from wildgs.viewer.cameras import ViserCamera, pose_of
 from wildgs.viewer.comparison import compare
 from wildgs.viewer.display import Paint, SplatDisplay
 from wildgs.viewer.film import free_name, make_film
@@ -125,7 +125,7 @@ class Viewer:
     def _greet(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(self._camera_moved)
 
-    def _camera_moved(self, camera: viser.CameraHandle) -> None:
+    def _camera_moved(self, camera: ViserCamera) -> None:
         eye = torch.from_numpy(np.asarray(camera.position)).float()
         if (eye - self.display.eye).norm() < REPAINT_DISTANCE:
             return
