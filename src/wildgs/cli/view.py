@@ -55,7 +55,7 @@ def open_viewer(command: Command) -> Viewer:
     server = open_server(command.server, command.run.resolve().name)
     try:
         scene = load(command.run)
-        subject = Subject(scene.run.method, scene.scene)
+        subject = Subject(scene.run.method, scene.scene, scene.appearance)
         status = f"step {scene.run.step:,}, {len(scene.gaussians):,} Gaussians"
         return Viewer(server, subject, command.viewer, command.appearance, status, command.run / VIDEO_FOLDER)
     except BaseException:

@@ -30,11 +30,13 @@ class Look:
         name: For people and for file names.
         embeddings: What `mix` mixes; None for a method that has one light only (plain 3DGS).
         method: The trained method to which the embeddings belong.
+        note: How the light was found, where that is worth a line to the user.
     """
 
     name: str
     embeddings: Embeddings | None = field(repr=False)
     method: Method = field(repr=False)
+    note: str = ""
 
     @cached_property
     def sh(self) -> Float[Tensor, "N K 3"]:
@@ -48,11 +50,10 @@ class Look:
 
 
 @torch.no_grad()
-def look_of(method: Method, appearance: Appearance, name: str) -> Look:
+def look_of(method: Method, appearance: Appearance, name: str, note: str = "") -> Look:
     """The look of an encoded photo."""
-    if not isinstance(method, WildGS):
-        return Look(name, None, method)
-    return Look(name, method.embed(appearance), method)
+    embeddings = method.embed(appearance) if isinstance(method, WildGS) else None
+    return Look(name, embeddings, method, note)
 
 
 def own_look(method: Method) -> Look:

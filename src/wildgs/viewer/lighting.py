@@ -84,6 +84,7 @@ class LightPanel:
         gallery: Gallery,
         changed: Callable[[], None],
         complain: Callable[[str], None],
+        lender: Callable[[], str],
     ) -> None:
         """Adds the controls to the container that is open.
 
@@ -93,10 +94,11 @@ class LightPanel:
             gallery: Photos to choose from.
             changed: Called, on a thread of viser's, after the desk changed.
             complain: Called with one line for a picture that cannot be used.
+            lender: Names the photo whose camera a picture borrows.
         """
         self.desk = desk
         self._server, self._gallery = server, gallery
-        self._changed, self._complain = changed, complain
+        self._changed, self._complain, self._lender = changed, complain, lender
         self._uploads = tempfile.TemporaryDirectory(prefix="wildgs-view-")
         self._number = 0
         self.touched = False
@@ -149,7 +151,7 @@ class LightPanel:
         except UserError as error:
             self._complain(str(error))
             return
-        self.choose(Light(str(file), name, self._gallery.names[0]))
+        self.choose(Light(str(file), name, self._lender()))
 
     def _set(self, desk: LightDesk) -> None:
         self.desk = desk

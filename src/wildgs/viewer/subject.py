@@ -5,38 +5,48 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from wildgs.data import Scene, View
+from wildgs.data import Scene, View, match_view
 from wildgs.engine.trainer import Trainer
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
-from wildgs.light.look import Look, look_of
-from wildgs.light.photos import encode_view, match_view
+from wildgs.light.look import NEUTRAL, Look, look_of
+from wildgs.light.photos import encode_view
 from wildgs.light.sources import LightSources
 from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
 from wildgs.rasterize import Rendering, blend, sh_to_colors
 
 
+@runtime_checkable
+class FindLook(Protocol):
+    """How a look is found by what a user writes."""
+
+    def __call__(self, spec: str | Path, *, like: str | None = None) -> Look:
+        """See `wildgs.light.sources.LightSources.find`."""
+        ...
+
+
 class Subject:
     """A trained method among its photos."""
 
-    def __init__(self, method: Method, scene: Scene, sources: LightSources | None = None) -> None:
+    def __init__(self, method: Method, scene: Scene, find_look: FindLook | None = None) -> None:
         """Sets up a `Subject`.
 
         Args:
             method: What is shown.
             scene: Its photos.
-            sources: Looks that were found before; None begins with none.
+            find_look: `LoadedScene.appearance`, or the like; None looks among the scene's photos and files.
         """
         self.method = method
         self.scene = scene
         self.sh_degree = method.sh_degree
-        self._sources = sources or LightSources(method, lambda: scene)
+        self._find_look = find_look or LightSources(method, lambda: scene).find
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -64,7 +74,7 @@ class Subject:
         Raises:
             UserError: There is no such photo or file, or it cannot be read.
         """
-        return self._sources.find(spec, like=like)
+        return self._find_look(spec if self.relightable else NEUTRAL, like=like)
 
     @torch.no_grad()
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
@@ -113,7 +123,7 @@ class TrainingSubject(Subject):
         self._step = self._trainer.step
         stage = self._trainer.schedule.stage(self._step, self.method.sh_degree)
         self.sh_degree, self._explicit = stage.sh_degree, stage.explicit
-        self._sources = LightSources(self.method, lambda: self.scene)
+        self._find_look = LightSources(self.method, lambda: self.scene).find
 
     def look(self, spec: str | Path, like: str | None = None) -> Look:
         """As `Subject.look`; without local light as long as training is without it."""

@@ -99,7 +99,12 @@ class Viewer:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Light"):
             self.lighting = LightPanel(
-                self.server, self._first_desk(lights), self.gallery, self._light_changed, self.complain
+                self.server,
+                self._first_desk(lights),
+                self.gallery,
+                self._light_changed,
+                self.complain,
+                self._nearest_photo,
             )
             self.lighting.touched = bool(lights)
         with tabs.add_tab("Photos"):
@@ -112,6 +117,11 @@ class Viewer:
         chosen = [*lights, *(name for name in (names[0], names[-1]) if name not in lights)]
         first, second = (chosen * 2)[:2]
         return LightDesk(Light(first, Path(first).name), Light(second, Path(second).name))
+
+    def _nearest_photo(self) -> str:
+        """The photo taken nearest to where somebody looks from: a picture is draped over what it shows."""
+        positions = torch.stack([view.camera.position.cpu() for view in self.subject.views])
+        return self.subject.views[int((positions - self.display.eye).norm(dim=1).argmin())].name
 
     def _set_start(self, view: View, distance: float) -> None:
         pose, camera = pose_of(view.camera), self.server.initial_camera
