@@ -34,11 +34,6 @@ class Thumbnail:
     button: str
 
 
-def escape_markdown(text: str) -> str:
-    """Text as it is, in viser's markdown, which takes HTML too."""
-    return "".join(f"&#{ord(sign)};" if not sign.isalnum() and sign not in " " else sign for sign in text)
-
-
 def escape(text: str) -> str:
     """Text as it is, in HTML."""
     return html.escape(text, quote=True)
