@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs.viewer.markup import CHOSEN_COLORS, Thumbnail, contact_sheet, figures, light_pair, thumbnail
+from wildgs.viewer.markup import (
+    CHOSEN_COLORS,
+    Thumbnail,
+    chosen_frames,
+    contact_sheet,
+    figures,
+    light_pair,
+    thumbnail,
+)
 
 NASTY = ["<script>alert(1)</script>", '" onclick="alert(1)', "' onmouseover='x", "</label><b>", "&lt;img&gt;"]
 PICTURE = np.zeros((4, 6, 3), dtype=np.uint8)
@@ -37,7 +45,7 @@ class Tags(HTMLParser):
 @pytest.mark.parametrize("name", NASTY)
 def test_names_stay_text(name: str) -> None:
     pages = [
-        contact_sheet([Thumbnail(name, "data:image/jpeg;base64,", "id")], (name, name)),
+        contact_sheet([Thumbnail(name, "data:image/jpeg;base64,", "id")]),
         light_pair(name, name, 0.3),
         figures([(name, PICTURE)], name),
     ]
@@ -51,9 +59,15 @@ def test_names_stay_text(name: str) -> None:
 
 
 def test_chosen_photos_have_their_light_s_frame() -> None:
-    thumbnails = [Thumbnail(name, "data:,", name) for name in "abc"]
-    frames = re.findall(r"border:3px solid ([^;]+);", contact_sheet(thumbnails, ("b", "c")))
-    assert frames == ["transparent", *CHOSEN_COLORS]
+    frames = re.findall(r'label\[for="(\w+)"\] img\{outline:3px solid ([^}]+)\}', chosen_frames(["b", "c"]))
+    assert sorted(frames) == [("b", CHOSEN_COLORS[0]), ("c", CHOSEN_COLORS[1])]
+    assert CHOSEN_COLORS[1] not in chosen_frames(["b", None])
+
+
+def test_of_one_photo_for_both_lights_the_first_frame_is_seen() -> None:
+    """The rule that comes last wins."""
+    page = chosen_frames(["b", "b"])
+    assert page.index(CHOSEN_COLORS[0]) > page.index(CHOSEN_COLORS[1])
 
 
 def test_thumbnails_keep_their_shape() -> None:

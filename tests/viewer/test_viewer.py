@@ -139,6 +139,7 @@ def test_a_light_that_cannot_be_is_a_message_and_nothing_else(
     work_off(viewer)
     viewer.lighting.take_picture("empty.jpg", b"")
     assert len(said) == 2
+    assert "mine" not in viewer.lighting.desk.first.label, "the light before stays chosen"
     assert "not a readable picture" in said[0]
     assert "empty" in said[1]
     np.testing.assert_array_equal(colors(viewer), before)

@@ -14,7 +14,14 @@ import numpy as np
 from wildgs.errors import UserError
 from wildgs.light.look import Look, mix
 from wildgs.viewer.gallery import Gallery
-from wildgs.viewer.markup import Thumbnail, contact_sheet, drop_zone, element_id, light_pair
+from wildgs.viewer.markup import (
+    Thumbnail,
+    chosen_frames,
+    contact_sheet,
+    drop_zone,
+    element_id,
+    light_pair,
+)
 from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:
@@ -109,6 +116,7 @@ class LightPanel:
         self._sheet = gui.add_html("")
         self._buttons = {name: self._add_button(name) for name in gallery.names}
         self._slider = gui.add_slider("Mix", 0.0, 1.0, 0.01, desk.amount)
+        self._frames = gui.add_html("")
         self._pair = gui.add_html("")
         self._upload = gui.add_upload_button("A picture of your own", mime_type="image/*")
         gui.add_html(drop_zone(element_id(self._upload)))
@@ -116,8 +124,9 @@ class LightPanel:
         self._upload.on_upload(
             lambda _: self.take_picture(self._upload.value.name, self._upload.value.content)
         )
-        gallery.on_change(self.refresh)
-        self.refresh()
+        gallery.on_change(self._draw_thumbnails)
+        self._draw_thumbnails()
+        self._refresh()
 
     def _add_button(self, name: str) -> viser.GuiButtonHandle:
         button = self._server.gui.add_button(name)
@@ -157,17 +166,30 @@ class LightPanel:
         self.desk = desk
         if self._slider.value != desk.amount:
             self._slider.value = desk.amount
-        self.refresh()
+        self._refresh()
         self._changed()
 
-    def refresh(self) -> None:
-        """Draws the thumbnails that there are, and which are chosen."""
+    def take_back(self, desk: LightDesk) -> None:
+        """Stands as before: a light could not be found."""
+        self.desk = desk
+        self._slider.value = desk.amount
+        self._refresh()
+
+    def _draw_thumbnails(self) -> None:
+        self._sheet.content = contact_sheet(
+            [
+                Thumbnail(name, source, element_id(self._buttons[name]))
+                for name, source in self._gallery.sources()
+            ]
+        )
+
+    def _refresh(self) -> None:
+        """Shows which lights are chosen, and how much of each."""
         desk = self.desk
-        thumbnails = [
-            Thumbnail(name, source, element_id(self._buttons[name]))
-            for name, source in self._gallery.sources()
-        ]
-        self._sheet.content = contact_sheet(thumbnails, (desk.first.label, desk.second.label))
+        buttons = [self._buttons.get(light.spec) for light in (desk.first, desk.second)]
+        self._frames.content = chosen_frames(
+            [None if button is None else element_id(button) for button in buttons]
+        )
         self._pair.content = light_pair(desk.first.label, desk.second.label, desk.amount)
 
     def close(self) -> None:

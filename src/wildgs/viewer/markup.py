@@ -58,34 +58,39 @@ def thumbnail(photo: UInt8[Tensor, "H W 3"], side: int = THUMBNAIL_SIDE) -> UInt
     return np.asarray(image).copy()
 
 
-def contact_sheet(thumbnails: Sequence[Thumbnail], chosen: Sequence[str]) -> str:
+def contact_sheet(thumbnails: Sequence[Thumbnail]) -> str:
     """Thumbnails in a grid; each is a label of a button, which is not shown itself.
 
     A label passes its click on without a script, so nothing that a photo is called can become one.
-
-    Args:
-        thumbnails: What to show.
-        chosen: Names of the first and the second light's photos.
     """
     hidden = ",".join(f'div:has(> [id="{thumb.button}"])' for thumb in thumbnails)
-    cells = "".join(_cell(thumb, chosen) for thumb in thumbnails)
+    cells = "".join(
+        f'<label for="{escape(thumb.button)}" title="{escape(thumb.name)}" style="cursor:pointer;display:block;'
+        f'line-height:0;padding:3px"><img src="{thumb.source}" alt="{escape(thumb.name)}" '
+        'style="width:100%;height:56px;object-fit:cover;border-radius:3px"></label>'
+        for thumb in thumbnails
+    )
     return (
         f"<style>{hidden}{{display:none}}</style>"
-        '<div style="display:grid;grid-template-columns:repeat(4,1fr);gap:4px;margin:4px 10px 8px;'
+        '<div style="display:grid;grid-template-columns:repeat(4,1fr);margin:4px 8px 8px;'
         f'max-height:260px;overflow-y:auto">{cells}</div>'
     )
 
 
-def _cell(thumb: Thumbnail, chosen: Sequence[str]) -> str:
-    frame = "transparent"
-    for name, color in reversed(list(zip(chosen, CHOSEN_COLORS, strict=False))):
-        frame = color if name == thumb.name else frame
-    return (
-        f'<label for="{escape(thumb.button)}" title="{escape(thumb.name)}" style="cursor:pointer;display:block;'
-        f'border:3px solid {frame};border-radius:5px;line-height:0">'
-        f'<img src="{thumb.source}" alt="{escape(thumb.name)}" '
-        'style="width:100%;height:56px;object-fit:cover;border-radius:2px"></label>'
+def chosen_frames(buttons: Sequence[str | None]) -> str:
+    """Frames around the thumbnails of the first and the second light.
+
+    Apart from the thumbnails themselves, which would scroll back to the top whenever they are sent again.
+
+    Args:
+        buttons: Ids of their buttons; None for a light that is no thumbnail.
+    """
+    rules = (
+        f'label[for="{button}"] img{{outline:3px solid {color}}}'
+        for button, color in reversed(list(zip(buttons, CHOSEN_COLORS, strict=True)))
+        if button is not None
     )
+    return f"<style>{''.join(rules)}</style>"
 
 
 def light_pair(first: str, second: str, amount: float) -> str:

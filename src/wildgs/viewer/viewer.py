@@ -81,7 +81,8 @@ class Viewer:
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
         self._closing = threading.Event()
-        self.gallery = Gallery(spread(subject.views, config.photos))
+        self._lit_by: LightDesk | None = None
+        self.gallery = Gallery(spread(subject.views, max(config.photos, 1)))
         start, distance = overview(subject.scene)
         self._set_start(start, distance)
         self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
@@ -191,11 +192,21 @@ class Viewer:
         except UserError as error:
             self.complain(str(error))
         except Exception as error:
+            if self._closing.is_set():
+                return  # what it worked with is gone already
             traceback.print_exc()
             self.complain(f"{type(error).__name__} in the viewer; its log says where")
 
     def _relight(self) -> None:
-        self.display.show(self.lighting.desk.look(self.subject))
+        desk = self.lighting.desk
+        try:
+            look = desk.look(self.subject)
+        except UserError:
+            if self._lit_by not in (None, desk):
+                self.lighting.take_back(self._lit_by)
+            raise
+        self._lit_by = desk
+        self.display.show(look)
         if self.photos.current is not None and not self.photos.own_light.value:
             self._ask("compare", self._compare)
 
