@@ -202,7 +202,7 @@ class Viewer:
         try:
             look = desk.look(self.subject)
         except UserError:
-            if self._lit_by not in (None, desk):
+            if self._lit_by is not None and self._lit_by != desk:
                 self.lighting.take_back(self._lit_by)
             raise
         self._lit_by = desk
