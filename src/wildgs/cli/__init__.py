@@ -19,6 +19,7 @@ VERBS = {
     "render": "pictures and videos of a run in the light of any photo",
     "gallery": "views x appearances of a run as one picture",
     "appearance": "the light of a photo, or a mix of several, as a small file",
+    "view": "fly through a run in the browser, under any light",
     "depth": "fill a scene's depth/ with Depth Anything V2",
     "doctor": "what works on this machine, and how to get what does not",
 }

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import gc
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 import tyro
@@ -19,7 +20,7 @@ from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.engine.autosave import Autosave, AutosaveConfig
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
-from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.engine.trainer import Observer, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
@@ -31,6 +32,10 @@ from wildgs.runs import (
     refuse_trained,
     save_run,
 )
+from wildgs.viewer.server import ServerConfig, import_viser
+
+if TYPE_CHECKING:
+    from wildgs.viewer.viewer import Viewer
 
 RETRY_SHARE = 0.8
 """Of the Gaussians with which memory ran out, for the second try."""
@@ -57,6 +62,9 @@ class Command:
     model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     autosave: Annotated[AutosaveConfig, tyro.conf.arg(name="")] = field(default_factory=AutosaveConfig)
+    view: bool = False
+    """Show training in the browser, and stay there when it is done. Takes at most 5% of the time."""
+    server: ServerConfig = field(default_factory=ServerConfig)
 
 
 def run(command: Command) -> None:
@@ -68,12 +76,55 @@ def run(command: Command) -> None:
             config = replace(config, data=replace(config.data, image_cache=command.data.image_cache))
     if command.max_gaussians is not None:
         config = with_budget(config, command.max_gaussians)
+    if command.view:
+        import_viser()  # a mistake is told before photos are read
     with lock_run(command.output):
         scene = read_scene(config)
         if not command.resume:
             refuse_trained(command.output)
             config = plan_memory(config, scene, explicit=command.max_gaussians is not None)
-        train_within_memory(command.output, config, scene, resume=command.resume, autosave=command.autosave)
+        window = Window(scene, command.server, command.output.resolve().name) if command.view else None
+        train_within_memory(
+            command.output, config, scene, resume=command.resume, autosave=command.autosave, window=window
+        )
+    if window is not None:
+        window.stay()
+
+
+class Window:
+    """The viewer beside a training."""
+
+    def __init__(self, scene: Scene, server: ServerConfig, title: str) -> None:
+        """Sets up a `Window`; `open` shows it."""
+        self._scene, self._server, self._title = scene, server, title
+        self._viewer: Viewer | None = None
+        self._trainer: Trainer | None = None
+
+    def open(self, trainer: Trainer) -> Observer:
+        """Shows a training; what it returns gives the viewer its turns between two steps."""
+        from wildgs.cli.view import watch_training
+
+        self._trainer = trainer
+        self._viewer, turns = watch_training(trainer, self._scene, self._server, self._title)
+        return turns
+
+    def close(self) -> None:
+        """Shuts the viewer and lets go of the trainer."""
+        if self._viewer is not None:
+            self._viewer.close()
+        self._viewer = self._trainer = None
+
+    def stay(self) -> None:
+        """Keeps showing what was trained, until Ctrl-C."""
+        from wildgs.cli.view import stay
+
+        if self._viewer is None or self._trainer is None:
+            return
+        console.print("the viewer stays open (Ctrl-C ends it)")
+        count = len(self._trainer.method.gaussians)
+        self._viewer.set_status(f"trained {self._trainer.step:,} steps, {count:,} Gaussians")
+        self._viewer.ask_for_update()
+        stay(self._viewer)
 
 
 def read_scene(config: RunConfig) -> Scene:
@@ -134,14 +185,20 @@ def train_or_go_on(folder: Path, config: RunConfig, scene: Scene) -> None:
 
 
 def train_within_memory(
-    folder: Path, config: RunConfig, scene: Scene, *, resume: bool, autosave: AutosaveConfig | None = None
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    *,
+    resume: bool,
+    autosave: AutosaveConfig | None = None,
+    window: Window | None = None,
 ) -> None:
     """Trains to the end; where the GPU's memory runs out, once more from the newest checkpoint with less.
 
     Raises:
         UserError: Memory ran out twice.
     """
-    lowered = _train_unless_full(folder, config, scene, resume, autosave)
+    lowered = _train_unless_full(folder, config, scene, resume, autosave, window)
     if lowered is None:
         return
     gc.collect()
@@ -151,7 +208,7 @@ def train_within_memory(
         f"the GPU's memory ran out; going on from the newest checkpoint with at most {budget:,} Gaussians"
     )
     warnings.warn(message, WildGSWarning, stacklevel=2)
-    if _train_unless_full(folder, lowered, scene, True, autosave) is not None:
+    if _train_unless_full(folder, lowered, scene, True, autosave, window) is not None:
         raise UserError(
             "the GPU's memory ran out again: go on with --resume and a lower --max-gaussians, or start anew with a "
             "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
@@ -159,7 +216,12 @@ def train_within_memory(
 
 
 def _train_unless_full(
-    folder: Path, config: RunConfig, scene: Scene, resume: bool, autosave: AutosaveConfig | None
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    resume: bool,
+    autosave: AutosaveConfig | None,
+    window: Window | None,
 ) -> RunConfig | None:
     """Trains to the end, or returns the configuration to try next.
 
@@ -168,11 +230,18 @@ def _train_unless_full(
     trainer: Trainer | None = None
     try:
         trainer = prepare_training(folder, config, scene, resume=resume)
-        train_to_end(folder, config, scene, trainer, autosave)
+        observers = [] if window is None else [window.open(trainer)]
+        train_to_end(folder, config, scene, trainer, autosave, observers)
     except torch.OutOfMemoryError:
+        if window is not None:
+            window.close()
         count = len(scene.points) if trainer is None else len(trainer.method.gaussians)
         budget = min(count, config.train.density.max_gaussians)
         return with_budget(config, max(1, int(RETRY_SHARE * budget)))
+    except BaseException:
+        if window is not None:
+            window.close()
+        raise
     return None
 
 
@@ -182,6 +251,7 @@ def train_to_end(
     scene: Scene,
     trainer: Trainer,
     autosave: AutosaveConfig | None = None,
+    observers: Sequence[Observer] = (),
 ) -> None:
     """Trains what is left, recording and saving.
 
@@ -202,7 +272,7 @@ def train_to_end(
     ):
         logger.info("%s from step %d of %d", label, trainer.step, config.train.steps)
         try:
-            trainer.run([recorder, progress, saver, stop])
+            trainer.run([recorder, progress, saver, stop, *observers])
         except InterruptedTrainingError as interrupt:
             saver.save(trainer.step)
             interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)

@@ -1,0 +1,93 @@
+"""Between viser's cameras (a place, a quaternion, a vertical field of view) and ours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from wildgs.geometry.camera import Camera
+
+
+@runtime_checkable
+class ViserCamera(Protocol):
+    """What is read of `viser.CameraHandle`; axes are OpenCV's, as ours."""
+
+    @property
+    def wxyz(self) -> np.ndarray:
+        """Camera-to-world rotation."""
+        ...
+
+    @property
+    def position(self) -> np.ndarray:
+        """The camera's centre."""
+        ...
+
+    @property
+    def fov(self) -> float:
+        """Vertical field of view, radians."""
+        ...
+
+    @property
+    def aspect(self) -> float:
+        """Width over height."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A camera as viser has it.
+
+    Attributes:
+        wxyz: Camera-to-world rotation.
+        position: The camera's centre, world units.
+        fov: Vertical field of view, radians.
+        aspect: Width over height.
+    """
+
+    wxyz: Float[np.ndarray, " 4"]
+    position: Float[np.ndarray, " 3"]
+    fov: float
+    aspect: float
+
+
+def pose_of(camera: Camera) -> Pose:
+    """Our camera as viser's, whose optical axis always goes through the picture's middle."""
+    rotation = camera.viewmat[:3, :3].T.double().cpu().numpy()
+    xyzw = Rotation.from_matrix(rotation).as_quat()
+    return Pose(
+        wxyz=xyzw[[3, 0, 1, 2]],
+        position=camera.position.double().cpu().numpy(),
+        fov=2 * math.atan(camera.height / (2 * float(camera.K[1, 1]))),
+        aspect=camera.width / camera.height,
+    )
+
+
+def camera_of(camera: ViserCamera, height: int, aspect: float | None = None) -> Camera:
+    """A camera of viser's as ours, on a picture of a given height.
+
+    Args:
+        camera: A client's camera, or a `Pose`.
+        height: Of the picture, pixels.
+        aspect: Width over height; None keeps the camera's.
+    """
+    width = max(1, round(height * (aspect or camera.aspect)))
+    w, x, y, z = (float(value) for value in camera.wxyz)
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ np.asarray(camera.position, dtype=np.float64)
+    focal = height / (2 * math.tan(camera.fov / 2))
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
+    return Camera(torch.from_numpy(viewmat).float(), K, width, height)
+
+
+def fov_that_holds(pose: Pose, aspect: float) -> float:
+    """The vertical field of view at which a window of another shape shows all that the camera sees."""
+    half = math.tan(pose.fov / 2)
+    return 2 * math.atan(half * max(1.0, pose.aspect / aspect))

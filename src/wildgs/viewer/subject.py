@@ -1,0 +1,151 @@
+"""What the viewer shows: a method among its photos, trained or still training."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from wildgs.data import Scene, View, match_view
+from wildgs.engine.trainer import Trainer
+from wildgs.evaluation.metrics import to_8bit
+from wildgs.geometry.camera import Camera
+from wildgs.light.look import NEUTRAL, Look, look_of
+from wildgs.light.photos import encode_view
+from wildgs.light.sources import LightSources
+from wildgs.model.method import Method
+from wildgs.model.wildgs import WildGS
+from wildgs.rasterize import Rendering, blend, sh_to_colors
+
+
+@runtime_checkable
+class FindLook(Protocol):
+    """How a look is found by what a user writes."""
+
+    def __call__(self, spec: str | Path, *, like: str | None = None) -> Look:
+        """See `wildgs.light.sources.LightSources.find`."""
+        ...
+
+
+class Subject:
+    """A trained method among its photos."""
+
+    def __init__(self, method: Method, scene: Scene, find_look: FindLook | None = None) -> None:
+        """Sets up a `Subject`.
+
+        Args:
+            method: What is shown.
+            scene: Its photos.
+            find_look: `LoadedScene.appearance`, or the like; None looks among the scene's photos and files.
+        """
+        self.method = method
+        self.scene = scene
+        self.sh_degree = method.sh_degree
+        self._find_look = find_look or LightSources(method, lambda: scene).find
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """All photos with their cameras."""
+        return self.scene.views
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the method knows more than one light."""
+        return isinstance(self.method, WildGS)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the method is."""
+        return self.method.gaussians.means.device
+
+    @property
+    def version(self) -> int:
+        """Grows whenever the method has changed: what was computed before fits no longer."""
+        return 0
+
+    def look(self, spec: str | Path, like: str | None = None) -> Look:
+        """The light of a photo by name, or of any picture file, which borrows the camera of the photo `like`.
+
+        Raises:
+            UserError: There is no such photo or file, or it cannot be read.
+        """
+        return self._find_look(spec if self.relightable else NEUTRAL, like=like)
+
+    @torch.no_grad()
+    def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
+        """M of a photo (1 = static), in main memory; None for a method that predicts no mask."""
+        visibility = encode_view(self.method, view).visibility
+        return None if visibility is None else visibility.float().cpu()
+
+    @torch.no_grad()
+    def render(self, camera: Camera, look: Look) -> tuple[UInt8[Tensor, "H W 3"], Rendering]:
+        """A picture in main memory, and the rendering with depth and alpha from which it comes."""
+        camera = camera.to(self.device)
+        gaussians = self.method.gaussians
+        projection = gaussians.project(camera)
+        colors = sh_to_colors(
+            gaussians.means, look.sh, camera, degree=self.sh_degree, visible=projection.visible
+        )
+        rendering = blend(projection, colors)
+        return to_8bit(rendering.colors).cpu(), rendering
+
+
+class TrainingSubject(Subject):
+    """A method while it trains: seen as its training sees it, and only between two steps."""
+
+    def __init__(self, trainer: Trainer, scene: Scene) -> None:
+        """Sets up a `TrainingSubject`.
+
+        Args:
+            trainer: Must not be in the middle of a step when any method of this class is called.
+            scene: Its photos.
+        """
+        super().__init__(trainer.method, scene)
+        self._trainer = trainer
+        self._explicit = True
+        self._step = -1
+        self._catch_up()
+
+    @property
+    def version(self) -> int:
+        """The number of steps done."""
+        return self._trainer.step
+
+    def _catch_up(self) -> None:
+        """Forgets looks of earlier steps, which may have had other Gaussians, and takes over the stage."""
+        if self._step == self._trainer.step:
+            return
+        self._step = self._trainer.step
+        stage = self._trainer.schedule.stage(self._step, self.method.sh_degree)
+        self.sh_degree, self._explicit = stage.sh_degree, stage.explicit
+        self._find_look = LightSources(self.method, lambda: self.scene).find
+
+    def look(self, spec: str | Path, like: str | None = None) -> Look:
+        """As `Subject.look`; without local light as long as training is without it."""
+        self._catch_up()
+        with self._inference():
+            if self._explicit or not isinstance(self.method, WildGS):
+                return super().look(spec, like)
+            view = match_view(self.views, str(spec)) or match_view(self.views, like or "") or self.views[0]
+            with torch.no_grad():
+                photo = view.read_photo().to(self.device).float() / 255
+                return look_of(self.method, self.method.parse(photo), view.name)
+
+    def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
+        """As `Subject.visibility`."""
+        with self._inference():
+            return super().visibility(view)
+
+    @contextmanager
+    def _inference(self) -> Iterator[None]:
+        training = self.method.training
+        self.method.eval()
+        try:
+            yield
+        finally:
+            self.method.train(training)

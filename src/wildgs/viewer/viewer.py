@@ -1,0 +1,276 @@
+"""The viewer whole: a server, a subject, panels, and who does what on which thread.
+
+viser calls back on threads of its own. They only change small state and ask for work; whatever touches the method
+goes through one queue of jobs and is done by one thread: a worker's, or the trainer's between two steps.
+"""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from wildgs.data import Scene, View
+from wildgs.errors import UserError
+from wildgs.geometry.lens import focus
+from wildgs.model.gaussians import NEAR
+from wildgs.viewer.cameras import ViserCamera, pose_of
+from wildgs.viewer.comparison import compare
+from wildgs.viewer.display import Paint, SplatDisplay
+from wildgs.viewer.film import free_name, make_film
+from wildgs.viewer.gallery import Gallery, spread
+from wildgs.viewer.jobs import Job, Jobs
+from wildgs.viewer.lighting import Light, LightDesk, LightPanel, most_different
+from wildgs.viewer.markup import escape
+from wildgs.viewer.photos import PhotoPanel
+from wildgs.viewer.recording import RecordingPanel
+from wildgs.viewer.subject import Subject
+
+if TYPE_CHECKING:
+    import viser
+
+REPAINT_SECONDS = 0.4
+"""While the camera moves, colours follow no more often: each time, all splats are sent anew."""
+REPAINT_DISTANCE = 0.01
+"""In the photos' usual depth; a shorter way changes no direction by more than about half a degree."""
+FAR = 1000.0
+PAINTS: tuple[Paint, ...] = ("colour", "depth")
+
+
+@dataclass(frozen=True)
+class ViewerConfig:
+    """What is shown.
+
+    Attributes:
+        photos: How many photos are offered as thumbnails and frustums; more are reached by name.
+    """
+
+    photos: int = 48
+
+
+class Viewer:
+    """One page on a subject."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        subject: Subject,
+        config: ViewerConfig,
+        lights: Sequence[str] = (),
+        status: str = "",
+        videos: Path | None = None,
+    ) -> None:
+        """Builds the page.
+
+        Args:
+            server: Empty.
+            subject: What is shown.
+            config: How.
+            lights: Up to two specs of lights to begin with; the rest is chosen from the photos.
+            status: A line about the subject.
+            videos: Where videos go; None where none can be made (training).
+        """
+        self.server, self.subject = server, subject
+        self.jobs = Jobs()
+        self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
+        self._closing = threading.Event()
+        self._lit_by: LightDesk | None = None
+        self.gallery = Gallery(spread(subject.views, max(config.photos, 1)))
+        start, distance = overview(subject.scene)
+        self._set_start(start, distance)
+        self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
+        self._build(lights, status, videos)
+        server.on_client_connect(self._greet)
+        self._ask("light", self._relight)
+        self._ask("gallery", self._load_thumbnails)
+
+    def _build(self, lights: Sequence[str], status: str, videos: Path | None) -> None:
+        gui = self.server.gui
+        self._status = gui.add_html("")
+        self.set_status(status)
+        self._paint = gui.add_dropdown("Show", PAINTS, hint="depth: near is bright, far is dark")
+        self._paint.on_update(lambda _: self._set_paint(self._paint.value))
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Light"):
+            self.lighting = LightPanel(
+                self.server,
+                self._first_desk(lights),
+                self.gallery,
+                self._light_changed,
+                self.complain,
+                self._nearest_photo,
+            )
+            self.lighting.touched = bool(lights)
+        with tabs.add_tab("Photos"):
+            self.photos = PhotoPanel(self.server, self.subject.views, self.gallery, self._visited)
+        with tabs.add_tab("Path"):
+            self.recording = RecordingPanel(self.server, videos, self._film_ordered)
+
+    def _first_desk(self, lights: Sequence[str]) -> LightDesk:
+        names = self.gallery.names
+        chosen = [*lights, *(name for name in (names[0], names[-1]) if name not in lights)]
+        first, second = (chosen * 2)[:2]
+        return LightDesk(Light(first, Path(first).name), Light(second, Path(second).name))
+
+    def _nearest_photo(self) -> str:
+        """The photo taken nearest to where somebody looks from: a picture is draped over what it shows."""
+        positions = torch.stack([view.camera.position.cpu() for view in self.subject.views])
+        return self.subject.views[int((positions - self.display.eye).norm(dim=1).argmin())].name
+
+    def _set_start(self, view: View, distance: float) -> None:
+        pose, camera = pose_of(view.camera), self.server.initial_camera
+        camera.position = pose.position
+        camera.look_at = pose.position + distance * view.camera.forward.double().cpu().numpy()
+        camera.up = np.array([0.0, 0.0, 1.0])
+        camera.fov, camera.near, camera.far = pose.fov, NEAR, FAR
+
+    # What viser's threads call: state, and requests for work.
+
+    def _greet(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(self._camera_moved)
+
+    def _camera_moved(self, camera: ViserCamera) -> None:
+        eye = torch.from_numpy(np.asarray(camera.position)).float()
+        if (eye - self.display.eye).norm() < REPAINT_DISTANCE:
+            return
+        self.display.eye = eye
+        with self._lock:
+            if self._timer is None:
+                self._timer = threading.Timer(REPAINT_SECONDS, self._repaint_soon)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def _repaint_soon(self) -> None:
+        with self._lock:
+            self._timer = None
+        self._ask("paint", self.display.repaint)
+
+    def _set_paint(self, paint: Paint) -> None:
+        self.display.paint = paint
+        self._ask("paint", self.display.repaint)
+
+    def _light_changed(self) -> None:
+        self._ask("light", self._relight)
+
+    def _visited(self, view: View) -> None:
+        self._ask("compare", self._compare)
+
+    def _film_ordered(self, client: viser.ClientHandle | None) -> None:
+        self._ask("film", lambda: self._film(client))
+
+    def ask_for_update(self) -> None:
+        """Has the subject's present state shown: its Gaussians, its light encoded anew, the photo in question."""
+        self._ask("light", self._relight)
+        if self.photos.current is not None:
+            self._ask("compare", self._compare)
+
+    def set_status(self, text: str) -> None:
+        """Shows a line about the subject."""
+        self._status.content = f'<div style="font-size:12px;margin:2px 12px 6px">{escape(text)}</div>'
+
+    def complain(self, message: str) -> None:
+        """Shows a line in every browser: something could not be done."""
+        for client in self.server.get_clients().values():
+            client.add_notification("That did not work", message, color="red", auto_close_seconds=15)
+
+    def _ask(self, kind: str, job: Job) -> None:
+        self.jobs.put(kind, lambda: self._try(job))
+
+    # What the one working thread does.
+
+    def _try(self, job: Job) -> None:
+        """A job that fails must end neither the worker nor the training."""
+        try:
+            job()
+        except UserError as error:
+            self.complain(str(error))
+        except Exception as error:
+            if self._closing.is_set():
+                return  # what it worked with is gone already
+            traceback.print_exc()
+            self.complain(f"{type(error).__name__} in the viewer; its log says where")
+
+    def _relight(self) -> None:
+        desk = self.lighting.desk
+        try:
+            look = desk.look(self.subject)
+        except UserError:
+            if self._lit_by is not None and self._lit_by != desk:
+                self.lighting.take_back(self._lit_by)
+            raise
+        self._lit_by = desk
+        self.display.show(look)
+        if self.photos.current is not None and not self.photos.own_light.value:
+            self._ask("compare", self._compare)
+
+    def _compare(self) -> None:
+        view = self.photos.current
+        if view is not None:
+            own = self.photos.own_light.value
+            look = self.subject.look(view.name) if own else self.lighting.desk.look(self.subject)
+            self.photos.show(compare(self.subject, view, look))
+
+    def _film(self, client: viser.ClientHandle | None) -> None:
+        panel = self.recording
+        if panel.folder is None:
+            return
+        order = panel.order()
+
+        def told(done: int, total: int) -> bool:
+            if done % 5 == 0 or done == total:
+                panel.tell(f"frame {done} of {total}")
+            return not self._closing.is_set()
+
+        try:
+            file = make_film(self.subject, self.lighting.desk, order, free_name(panel.folder), told)
+        except Exception:
+            panel.tell("there is no video")
+            raise
+        panel.tell(f"written: {file}")
+        if client is not None:
+            client.send_file_download(file.name, file.read_bytes())
+
+    def _load_thumbnails(self) -> None:
+        if self.gallery.load_some():
+            self._ask("gallery", self._load_thumbnails)
+        elif self.subject.relightable and (colors := self.gallery.mean_colors()):
+            first = next(iter(colors))
+            self.lighting.suggest(first, most_different(colors, first))
+
+    def close(self) -> None:
+        """Ends the work and the server."""
+        self._closing.set()
+        self.jobs.close()
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+        self.lighting.close()
+        self.server.stop()
+
+
+def overview(scene: Scene) -> tuple[View, float]:
+    """A photo that shows the landmark from afar, and how far away that is: where flying begins.
+
+    Of the photos taken from beyond the usual distance it is the one that looks most straight at what all look at.
+    """
+    target = torch.from_numpy(
+        focus([view.camera for view in scene.views], scene.points.median(dim=0).values.double().numpy())
+    ).float()
+    ahead = [target - view.camera.position.cpu() for view in scene.views]
+    distances = torch.stack([offset.norm() for offset in ahead])
+    cosines = torch.stack(
+        [
+            view.camera.forward.cpu() @ offset / offset.norm().clamp_min(1e-6)
+            for view, offset in zip(scene.views, ahead, strict=True)
+        ]
+    )
+    far = (distances >= distances.median()) & (distances <= distances.quantile(0.9))
+    best = int(torch.where(far, cosines, cosines - 2).argmax())
+    return scene.views[best], max(float(distances[best]), 10 * NEAR)

@@ -1,0 +1,117 @@
+"""The page in a real browser: the splats are drawn, lights differ, clicks arrive."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from wildgs.evaluation.metrics import psnr
+from wildgs.viewer.cameras import pose_of
+from wildgs.viewer.jobs import start_worker
+from wildgs.viewer.server import ServerConfig, address, open_server
+from wildgs.viewer.subject import Subject
+from wildgs.viewer.viewer import Viewer, ViewerConfig
+
+pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+pytestmark = [pytest.mark.chromium, pytest.mark.timeout(600)]
+
+LIBRARY_NOISE = "computeBoundingSphere"
+"""viser's own splat mesh has positions of two numbers, at which three.js complains."""
+
+
+@pytest.fixture
+def viewer(subject: Subject) -> Iterator[Viewer]:
+    server = open_server(ServerConfig(port=0), "wall")
+    viewer = Viewer(server, subject, ViewerConfig())
+    worker = start_worker(viewer.jobs)
+    yield viewer
+    viewer.close()
+    worker.join(60)
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "the browser did not get there"
+        time.sleep(0.1)
+
+
+def drawn(viewer: Viewer, size: int = 256) -> np.ndarray:
+    """What the browser draws from the first photo's camera, without panels; cameras hidden."""
+    client = next(iter(viewer.server.get_clients().values()))
+    pose = pose_of(viewer.subject.views[0].camera)
+    picture = client.get_render(
+        size, size, wxyz=pose.wxyz, position=pose.position, fov=pose.fov, transport_format="png", timeout=120
+    )
+    return picture[..., :3]
+
+
+def settled(viewer: Viewer) -> np.ndarray:
+    """What the browser draws once it draws something, and the same twice."""
+    seen = [np.zeros(1)]
+
+    def rests() -> bool:
+        time.sleep(1)
+        seen.append(drawn(viewer))
+        return seen[-1].max() > 30 and np.array_equal(seen[-1], seen[-2])
+
+    wait_for(rests)
+    return seen[-1]
+
+
+def test_page_draws_what_the_rasteriser_draws(
+    viewer: Viewer, subject: Subject, browse: Callable, tmp_path: Path
+) -> None:
+    page = browse(address(viewer.server, ServerConfig()))
+    wait_for(viewer.server.get_clients)
+    wait_for(lambda: len(viewer.gallery.sources()) == len(subject.views))
+    viewer.display.eye = subject.views[0].camera.position
+    pictures = {}
+    for amount in (0.0, 1.0):
+        viewer.lighting.set_amount(amount)
+        wait_for(lambda: viewer._lit_by == viewer.lighting.desk)
+        pictures[amount] = settled(viewer)
+        camera = subject.views[0].camera.resized(256, 256)
+        expected, _ = subject.render(camera, viewer.lighting.desk.look(subject))
+        assert psnr(torch.from_numpy(pictures[amount].copy()), expected) > 25
+    lit = (pictures[0.0].max(axis=2) > 8).mean()
+    assert lit > 0.5, "most of the picture is not background"
+    difference = np.abs(pictures[0.0].astype(float) - pictures[1.0]).mean()
+    assert difference > 10, "two lights give two pictures"
+    shot = Image.open(page.screenshot(tmp_path / "page.png")).convert("RGB")
+    assert np.asarray(shot).reshape(-1, 3).std(axis=0).max() > 10
+    assert [error for error in page.errors() if LIBRARY_NOISE not in error] == []
+    assert page.evaluate("document.title") != "1", "a file's name became a script"
+
+
+def test_a_click_on_a_thumbnail_gives_its_light(viewer: Viewer, subject: Subject, browse: Callable) -> None:
+    page = browse(address(viewer.server, ServerConfig()))
+    wait_for(lambda: len(viewer.gallery.sources()) == len(subject.views))
+    wait_for(
+        lambda: page.evaluate("document.querySelectorAll('label[title] img').length") == len(subject.views)
+    )
+    assert page.evaluate("document.querySelector('label[title] img').getBoundingClientRect().width") > 20
+    page.evaluate("document.querySelectorAll('label[title]')[3].click()")
+    wait_for(lambda: viewer.lighting.desk.first.spec == subject.views[3].name)
+    hidden = "[...document.querySelectorAll('button')].filter(b => b.textContent.endsWith('.jpg'))"
+    assert page.evaluate(f"{hidden}.every(b => b.getBoundingClientRect().height === 0)")
+
+
+def test_a_dropped_picture_gives_its_light(
+    viewer: Viewer, subject: Subject, browse: Callable, tmp_path: Path
+) -> None:
+    picture = tmp_path / "evening.png"
+    Image.fromarray(np.full((30, 40, 3), (250, 120, 20), dtype=np.uint8)).save(picture)
+    page = browse(address(viewer.server, ServerConfig()))
+    wait_for(lambda: page.evaluate("document.querySelectorAll('input[type=file]').length") == 1)
+    assert page.evaluate("document.querySelector('input[type=file]').getBoundingClientRect().height") > 30
+    root = page.call("DOM.getDocument")["root"]["nodeId"]
+    node = page.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
+    page.call("DOM.setFileInputFiles", files=[str(picture)], nodeId=node)
+    wait_for(lambda: viewer.lighting.desk.first.label == "evening.png")

@@ -1,0 +1,195 @@
+"""The page's logic on a real server, without a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from wildgs.data import Scene
+from wildgs.engine.trainer import Trainer
+from wildgs.viewer.cameras import Pose
+from wildgs.viewer.server import ServerConfig, open_server
+from wildgs.viewer.splats import colors_from
+from wildgs.viewer.subject import Subject, TrainingSubject
+from wildgs.viewer.viewer import Viewer, ViewerConfig
+
+pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+
+
+def work_off(viewer: Viewer) -> None:
+    while (job := viewer.jobs.take(wait=False)) is not None:
+        job()
+
+
+def open_on(subject: Subject, **options: Any) -> Viewer:
+    server = open_server(ServerConfig(port=0), "wall")
+    return Viewer(server, subject, ViewerConfig(**options), status="a wall")
+
+
+@pytest.fixture
+def viewer(subject: Subject) -> Iterator[Viewer]:
+    viewer = open_on(subject)
+    work_off(viewer)
+    yield viewer
+    viewer.close()
+
+
+def standing_at(place: np.ndarray) -> Pose:
+    return Pose(np.array([1.0, 0, 0, 0]), place.astype(float), 1.0, 1.5)
+
+
+def colors(viewer: Viewer) -> np.ndarray:
+    handle = viewer.display._handle
+    assert handle is not None
+    return handle.rgbs.astype(float) / 255
+
+
+def test_splats_are_the_gaussians_as_the_eye_sees_them(viewer: Viewer, subject: Subject) -> None:
+    handle = viewer.display._handle
+    assert handle is not None
+    assert len(handle.centers) == len(subject.method.gaussians)
+    look = viewer.lighting.desk.look(subject)
+    expected = colors_from(subject.method.gaussians.means, look.sh, viewer.display.eye, subject.sh_degree)
+    np.testing.assert_allclose(colors(viewer), expected, atol=1 / 255)
+
+
+def test_thumbnails_come_with_a_frustum_each(viewer: Viewer, wall: Scene) -> None:
+    assert [name for name, _ in viewer.gallery.sources()] == [view.name for view in wall.views]
+    assert len(viewer.photos._frustums) == len(wall.views)
+    assert viewer.lighting._sheet.content.count("<img") == len(wall.views)
+
+
+def test_begins_between_two_lights_that_differ(viewer: Viewer) -> None:
+    desk = viewer.lighting.desk
+    assert "dark" in desk.first.label
+    assert "dark" not in desk.second.label
+
+
+def test_moving_the_slider_changes_colours(viewer: Viewer) -> None:
+    seen = []
+    for amount in (0.0, 0.5, 1.0):
+        viewer.lighting.set_amount(amount)
+        work_off(viewer)
+        seen.append(colors(viewer).mean())
+    assert seen[0] < seen[1] < seen[2]
+
+
+def test_many_slider_moves_are_one_shading(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+    monkeypatch.setattr(viewer.display, "show", shown.append)
+    for amount in np.linspace(0.1, 0.9, 50):
+        viewer.lighting.set_amount(float(amount))
+    work_off(viewer)
+    assert len(shown) == 1
+
+
+def test_colours_follow_the_camera_s_place_but_not_its_turn(
+    viewer: Viewer, subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr("wildgs.viewer.viewer.REPAINT_SECONDS", 0.0)
+    monkeypatch.setattr(viewer, "_repaint_soon", lambda: asked.append(True))
+    place = viewer.display.eye.numpy()
+    viewer._camera_moved(standing_at(place))
+    assert asked == []
+    before = colors(viewer)
+    viewer._camera_moved(standing_at(place + [0.5, 0.2, 0.0]))
+    assert viewer._timer is not None
+    viewer._timer.join(20)
+    assert asked == [True]
+    viewer.display.repaint()
+    look = viewer.lighting.desk.look(subject)
+    eye = torch.from_numpy(place + [0.5, 0.2, 0.0]).float()
+    expected = colors_from(subject.method.gaussians.means, look.sh, eye, subject.sh_degree)
+    np.testing.assert_allclose(colors(viewer), expected, atol=1 / 255)
+    assert np.abs(expected - before).max() > 1 / 255
+
+
+def test_depth_is_bright_where_near(viewer: Viewer, subject: Subject) -> None:
+    viewer._set_paint("depth")
+    work_off(viewer)
+    distances = (subject.method.gaussians.means - viewer.display.eye).norm(dim=1).detach().numpy()
+    brightness = colors(viewer).sum(axis=1)
+    order = np.argsort(distances)
+    assert brightness[order[:20]].mean() > brightness[order[-20:]].mean() + 0.5
+
+
+def test_visiting_a_photo_shows_it_beside_its_render(viewer: Viewer, wall: Scene) -> None:
+    viewer.photos.visit(None, wall.views[5])
+    work_off(viewer)
+    page = viewer.photos._pictures.content
+    assert page.count("<img") == 4
+    assert "<img src=x" not in page
+    assert "&lt;img src=x" in page
+    assert viewer.photos._choice.value == wall.views[5].name
+
+
+def test_a_light_that_cannot_be_is_a_message_and_nothing_else(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(viewer, "complain", said.append)
+    viewer.lighting._complain = said.append
+    before = colors(viewer)
+    viewer.lighting.take_picture("mine.jpg", b"no picture")
+    work_off(viewer)
+    viewer.lighting.take_picture("empty.jpg", b"")
+    assert len(said) == 2
+    assert "mine" not in viewer.lighting.desk.first.label, "the light before stays chosen"
+    assert "not a readable picture" in said[0]
+    assert "empty" in said[1]
+    np.testing.assert_array_equal(colors(viewer), before)
+
+
+def test_a_fault_in_the_viewer_does_not_end_its_worker(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr(viewer.display, "show", fail)
+    viewer.lighting.set_amount(0.5)
+    work_off(viewer)
+    assert "a fault" in capsys.readouterr().err
+
+
+def test_few_photos_are_offered_of_many(subject: Subject) -> None:
+    viewer = open_on(subject, photos=2)
+    work_off(viewer)
+    assert len(viewer.gallery.sources()) == 2
+    viewer.close()
+
+
+def test_training_is_shown_as_it_goes_on(trainer_for, wall: Scene) -> None:
+    trainer: Trainer = trainer_for(wall, 30)
+    viewer = open_on(TrainingSubject(trainer, wall))
+    work_off(viewer)
+    before = colors(viewer)
+    trainer.run()
+    viewer.photos.visit(None, wall.views[0])
+    viewer.ask_for_update()
+    work_off(viewer)
+    assert trainer.method.training, "the method is left as training had it"
+    assert np.abs(colors(viewer) - before).max() > 2 / 255
+    assert viewer.photos._pictures.content.count("<img") == 4
+    viewer.close()
+
+
+def test_gaussians_that_came_meanwhile_are_shown(trainer_for, wall: Scene) -> None:
+    """Looks and splats of an earlier step have another number of rows."""
+    trainer: Trainer = trainer_for(wall, 30)
+    viewer = open_on(TrainingSubject(trainer, wall))
+    work_off(viewer)
+    rows = trainer.method.gaussians.rows
+    for name in list(rows):
+        rows[name] = torch.nn.Parameter(torch.cat([rows[name], rows[name][:7]]).detach())
+    trainer.step += 1
+    viewer.display.repaint()
+    viewer.lighting.set_amount(0.4)
+    work_off(viewer)
+    assert len(colors(viewer)) == len(trainer.method.gaussians) == len(wall.points) + 7
+    viewer.close()
