@@ -17,6 +17,7 @@ VERBS = {
     "eval": "score a run on its held-out photos",
     "render": "pictures of a run's views under the light of any of its photos",
     "depth": "fill a scene's depth/ with Depth Anything V2",
+    "bench": "methods x ablations x seeds on scenes -> one table",
     "doctor": "what works on this machine, and how to get what does not",
 }
 USER_ERROR = 2
