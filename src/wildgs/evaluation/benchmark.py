@@ -144,10 +144,12 @@ def _row(
 def _value(score: Score, name: str) -> float | None:
     metrics = score.metrics
     if name in _IN_MEAN:
-        return metrics["mean"][name]
-    if name in _MASKS:
-        return metrics.get("masks", {}).get(_MASKS[name])
-    return metrics[name]
+        value = metrics["mean"][name]
+    elif name in _MASKS:
+        value = metrics.get("masks", {}).get(_MASKS[name])
+    else:
+        value = metrics[name]
+    return None if value is None else float(value)
 
 
 def _gain(runs: Sequence[Score], reference: Mapping[int, float | None]) -> Spread | None:

@@ -41,4 +41,4 @@ def published_figures(scene: str, method: str) -> dict[str, float] | None:
     row = _TABLE[method]
     first = 3 * PHOTOTOURISM.index(scene)
     figures = dict(zip(_METRICS, row[first : first + 3], strict=True))
-    return figures | {"train_seconds": row[-2] * 3600, "render_fps": row[-1]}
+    return figures | {"train_seconds": row[-2] * 3600, "render_fps": float(row[-1])}
