@@ -134,6 +134,6 @@ def test_preset_without_scenes_or_split_says_what_to_do(tmp_path):
     (tmp_path / "sacre_coeur").mkdir()
     with (
         pytest.warns(WildGSWarning, match="no brandenburg_gate"),
-        pytest.raises(UserError, match="no split; put NeRF-W's .tsv"),
+        pytest.raises(UserError, match="no split; put NeRF-W's"),
     ):
         find_phototourism([tmp_path])
