@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from wildgs.data import Scene
 from wildgs.engine.trainer import Trainer
 
 TINY = (
@@ -90,14 +91,14 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
 ) -> None:
     from wildgs.cli import bench
 
-    start = bench.start_training
+    train_job = bench.train_job
 
-    def refuses_the_first(folder: Path, *arguments):
-        if "3dgs" in folder.parts:
+    def refuses_the_first(job: bench.Job, scene: Scene) -> None:
+        if job.method == "3dgs":
             raise MemoryError
-        return start(folder, *arguments)
+        train_job(job, scene)
 
-    monkeypatch.setattr(bench, "start_training", refuses_the_first)
+    monkeypatch.setattr(bench, "train_job", refuses_the_first)
     variant = ("--methods", "3dgs", "--variant", "plain:method=3dgs,train.steps=1", "--seeds", 0)
     assert wildgs("bench", landmark, "--output", tmp_path, *TINY, *variant) == 2
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
