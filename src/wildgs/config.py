@@ -7,6 +7,7 @@ import os
 import reprlib
 import types
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -156,3 +157,41 @@ def read_config(path: Path) -> RunConfig:
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # a date that is none: ValueError
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
     return from_plain(RunConfig, plain, str(path))
+
+
+def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "config") -> RunConfig:
+    """A configuration with some entries changed.
+
+    Args:
+        config: Left as it is.
+        entries: From an entry's path, as in ``train.optimizer.networks``, to its plain value.
+        where: Named in errors.
+
+    Raises:
+        UserError: There is no such entry, or the value is of the wrong type.
+    """
+    plain = to_plain(config)
+    for path, value in entries.items():
+        *parents, name = path.split(".")
+        inner = plain
+        for parent in parents:
+            inner = inner.setdefault(parent, {})
+            if not isinstance(inner, dict):
+                raise UserError(f"{where}: {path}: {parent} is a value and has no entries of its own")
+        inner[name] = value
+    return from_plain(RunConfig, plain, where)
+
+
+def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[Any, Any]]:
+    """Paths of the entries in which two configurations differ, each with both plain values."""
+    one, other = _flat(to_plain(first)), _flat(to_plain(second))
+    return {path: (value, other[path]) for path, value in one.items() if value != other[path]}
+
+
+def _flat(plain: Any, path: str = "") -> dict[str, Any]:
+    if not isinstance(plain, dict):
+        return {path: plain}
+    flat: dict[str, Any] = {}
+    for name, value in plain.items():
+        flat |= _flat(value, f"{path}.{name}" if path else name)
+    return flat

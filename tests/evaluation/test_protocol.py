@@ -148,6 +148,7 @@ def test_metrics_file_holds_what_the_design_names(tmp_path):
         "train_seconds",
         "render_fps",
         "device",
+        "lpips_network",
         "mean",
         "images",
         "notes",
@@ -157,6 +158,7 @@ def test_metrics_file_holds_what_the_design_names(tmp_path):
     assert content["step"] == 7
     assert content["render_fps"] > 0
     assert [image["name"] for image in content["images"]] == ["a.jpg", "b.jpg"]
+    assert content["lpips_network"] is None
     assert content["mean"]["lpips"] is None
     assert all(image["lpips"] is None for image in content["images"])
     assert any("LPIPS is null" in note for note in content["notes"])

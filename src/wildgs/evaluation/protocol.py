@@ -118,6 +118,7 @@ def evaluate(
         "train_seconds": train_seconds,
         "render_fps": fps,
         "device": _describe(device),
+        "lpips_network": None if lpips is None else lpips.network,
         "mean": {metric: _mean(scores, metric) for metric in METRICS},
         "images": [asdict(score) for score in scores],
         "notes": notes.lines,

@@ -1,0 +1,160 @@
+"""Scores of many runs -> one row per scene, protocol and method: means and spreads over seeds. Reads no file."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+BASELINE = "wildgs"
+MIXED = "mixed"
+PROTOCOLS = ("full", "half")
+_IN_MEAN = ("psnr", "ssim", "lpips")
+_PLAIN = ("train_seconds", "render_fps", "num_gaussians")
+_MASKS = {"mask_ap": "average_precision", "mask_iou": "iou"}
+QUANTITIES = (*_IN_MEAN, *_PLAIN, *_MASKS)
+
+
+@dataclass(frozen=True)
+class Score:
+    """One run under one protocol.
+
+    Attributes:
+        scene: The scene's name.
+        method: The method's name in the bench.
+        seed: Of the run.
+        metrics: What its `metrics.json` holds.
+    """
+
+    scene: str
+    method: str
+    seed: int
+    metrics: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and sample standard deviation over runs (None for one run)."""
+
+    mean: float
+    std: float | None
+    count: int
+
+    @classmethod
+    def of(cls, values: Sequence[float | None]) -> Spread | None:
+        """Over the values that are there; None where none is."""
+        known = [value for value in values if value is not None]
+        if not known:
+            return None
+        mean = math.fsum(known) / len(known)
+        return cls(mean, statistics.stdev(known) if len(known) > 1 else None, len(known))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        scene: The scene's name.
+        protocol: `full` or `half`.
+        method: The method's name.
+        label: How the table shows it.
+        seeds: Of its runs; empty for a method that has published figures only.
+        steps: Training steps.
+        quantities: By the names in `QUANTITIES`; None where nothing could be computed.
+        gain: PSNR minus the baseline's of the same seed; None for the baseline itself or without it.
+        lpips_network: `alex`, `squeeze`, None without LPIPS, or `mixed`: then LPIPS is None, since figures of
+            different networks do not compare.
+        device: On which it was timed.
+        published: The paper's figures, by the same names.
+    """
+
+    scene: str
+    protocol: str
+    method: str
+    label: str
+    seeds: tuple[int, ...]
+    steps: int | None
+    quantities: Mapping[str, Spread | None]
+    gain: Spread | None
+    lpips_network: str | None
+    device: str
+    published: Mapping[str, float] | None = None
+
+
+Published = Callable[[str, str], Mapping[str, float] | None]
+
+
+def summarize(
+    scores: Sequence[Score],
+    labels: Mapping[str, str],
+    *,
+    published: Published | None = None,
+    baseline: str = BASELINE,
+) -> list[Row]:
+    """Rows by scene (as they come), protocol, and method in the order of `labels`.
+
+    Args:
+        scores: Of any number of runs; the two protocols go to different rows.
+        labels: From method to what the table shows.
+        published: From scene and method to published figures, which stand in rows of protocol `full`. Methods
+            in `labels` without runs get a row where they have such figures.
+        baseline: The method against which gains are counted.
+    """
+    rows = []
+    for scene in dict.fromkeys(score.scene for score in scores):
+        for protocol in PROTOCOLS:
+            here = [s for s in scores if s.scene == scene and s.metrics["protocol"] == protocol]
+            reference = {s.seed: s.metrics["mean"]["psnr"] for s in here if s.method == baseline}
+            for method, label in labels.items():
+                runs = [s for s in here if s.method == method]
+                figures = published(scene, method) if published and protocol == "full" else None
+                if runs:
+                    gain = None if method == baseline else _gain(runs, reference)
+                    rows.append(_row(label, runs, gain, figures))
+                elif here and figures is not None:
+                    rows.append(Row(scene, protocol, method, label, (), None, {}, None, None, "", figures))
+    return rows
+
+
+def _row(
+    label: str, runs: Sequence[Score], gain: Spread | None, published: Mapping[str, float] | None
+) -> Row:
+    networks = {score.metrics.get("lpips_network") for score in runs}
+    quantities = {name: Spread.of([_value(score, name) for score in runs]) for name in QUANTITIES}
+    if len(networks) > 1:
+        quantities["lpips"] = None
+    return Row(
+        scene=runs[0].scene,
+        protocol=runs[0].metrics["protocol"],
+        method=runs[0].method,
+        label=label,
+        seeds=tuple(sorted(score.seed for score in runs)),
+        steps=runs[0].metrics["step"],
+        quantities=quantities,
+        gain=gain,
+        lpips_network=networks.pop() if len(networks) == 1 else MIXED,
+        device=" / ".join(sorted({score.metrics["device"] for score in runs})),
+        published=published,
+    )
+
+
+def _value(score: Score, name: str) -> float | None:
+    metrics = score.metrics
+    if name in _IN_MEAN:
+        value = metrics["mean"][name]
+    elif name in _MASKS:
+        value = metrics.get("masks", {}).get(_MASKS[name])
+    else:
+        value = metrics[name]
+    return None if value is None else float(value)
+
+
+def _gain(runs: Sequence[Score], reference: Mapping[int, float | None]) -> Spread | None:
+    gains: list[float | None] = []
+    for score in runs:
+        own, other = score.metrics["mean"]["psnr"], reference.get(score.seed)
+        gains.append(None if own is None or other is None else own - other)
+    return Spread.of(gains)

@@ -1,0 +1,185 @@
+"""Rows of a benchmark as markdown, csv and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wildgs.evaluation.benchmark import MIXED, QUANTITIES, Row, Spread
+
+NETWORKS = {"alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
+PUBLISHED = ("psnr", "ssim", "lpips", "train_seconds", "render_fps")
+MISSING = "-"
+
+
+@dataclass(frozen=True)
+class Section:
+    """The table of one scene under one protocol, as text.
+
+    Attributes:
+        title: Scene and protocol.
+        header: Of the columns that hold anything.
+        lines: A cell per column.
+    """
+
+    title: str
+    header: tuple[str, ...]
+    lines: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class _Column:
+    header: str
+    cell: Callable[[Row], str]
+
+
+def sections(rows: Sequence[Row]) -> list[Section]:
+    """One table per scene and protocol: figures of the two protocols never stand in one column."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.scene, row.protocol), []).append(row)
+    return [_section(f"{scene}, protocol {protocol}", group) for (scene, protocol), group in groups.items()]
+
+
+def _section(title: str, rows: Sequence[Row]) -> Section:
+    columns = [(column.header, [column.cell(row) for row in rows]) for column in _COLUMNS]
+    filled = [(header, cells) for header, cells in columns if any(cell != MISSING for cell in cells)]
+    lines = zip(*(cells for _, cells in filled), strict=True)
+    return Section(title, tuple(header for header, _ in filled), tuple(lines))
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:,.{digits}f}"
+
+
+def _spread(value: Spread | None, digits: int, *, unit: float = 1.0, sign: bool = False) -> str:
+    if value is None:
+        return MISSING
+    mean = f"{value.mean / unit:+.{digits}f}" if sign else _number(value.mean / unit, digits)
+    return mean if value.std is None else f"{mean} ± {_number(value.std / unit, digits)}"
+
+
+def _ours(name: str, digits: int, unit: float = 1.0) -> Callable[[Row], str]:
+    return lambda row: _spread(row.quantities.get(name), digits, unit=unit)
+
+
+def _paper(name: str, digits: int, unit: float = 1.0) -> Callable[[Row], str]:
+    def cell(row: Row) -> str:
+        return MISSING if row.published is None else _number(row.published[name] / unit, digits)
+
+    return cell
+
+
+_COLUMNS = (
+    _Column("method", lambda row: row.label),
+    _Column("seeds", lambda row: str(len(row.seeds)) if row.seeds else MISSING),
+    _Column("steps", lambda row: MISSING if row.steps is None else f"{row.steps:,}"),
+    _Column("PSNR ↑", _ours("psnr", 2)),
+    _Column("paper", _paper("psnr", 2)),
+    _Column("vs Wild-GS", lambda row: _spread(row.gain, 2, sign=True)),
+    _Column("SSIM ↑", _ours("ssim", 4)),
+    _Column("paper", _paper("ssim", 4)),
+    _Column("LPIPS ↓", _ours("lpips", 4)),
+    _Column("paper", _paper("lpips", 4)),
+    _Column("training, min", _ours("train_seconds", 1, 60.0)),
+    _Column("paper", _paper("train_seconds", 1, 60.0)),
+    _Column("frames/s", _ours("render_fps", 1)),
+    _Column("paper", _paper("render_fps", 2)),
+    _Column("Gaussians", _ours("num_gaussians", 0)),
+    _Column("mask AP ↑", _ours("mask_ap", 3)),
+    _Column("mask IoU ↑", _ours("mask_iou", 3)),
+)
+
+
+def legend(rows: Sequence[Row]) -> list[str]:
+    """What a reader must know to read the figures."""
+    lines = []
+    if any(len(row.seeds) > 1 for row in rows):
+        lines.append("Mean ± sample standard deviation over seeds.")
+    if any(row.gain is not None for row in rows):
+        lines.append("vs Wild-GS: difference in PSNR (dB), run by run with the same seed.")
+    if any(row.quantities.get("mask_ap") is not None for row in rows):
+        lines.append("Masks: average precision and IoU of transients in training photos, all pixels pooled.")
+    lines.append(_lpips_line(rows))
+    devices = ", ".join(sorted({row.device for row in rows if row.device}))
+    if devices:
+        lines.append(f"Timed on {devices}.")
+    if any(row.published is not None for row in rows):
+        lines.append(
+            "Paper: Xu, Mei, Patel 2024, table 1, photos at half resolution, one RTX 3090; training time and "
+            "frames per second are one figure for its three scenes. It does not say which network its LPIPS uses."
+        )
+    return lines
+
+
+def _lpips_line(rows: Sequence[Row]) -> str:
+    networks = {row.lpips_network for row in rows if row.seeds}
+    if networks == {None}:
+        return "LPIPS: none, its weights were not at hand."
+    if len(networks) == 1 and MIXED not in networks:
+        return (
+            f"LPIPS v0.1 with {' '.join(NETWORKS.get(str(network), str(network)) for network in networks)}."
+        )
+    return (
+        "LPIPS: runs were scored with different networks, or without one; figures of different networks do not "
+        "compare. The same command scores again what still has its checkpoint."
+    )
+
+
+def to_markdown(rows: Sequence[Row], heading: str, notes: Sequence[str] = ()) -> str:
+    """The tables with their legend.
+
+    Args:
+        rows: From `summarize`.
+        heading: First line below the title.
+        notes: Further lines for the legend.
+    """
+    parts = ["# Benchmark", heading]
+    for section in sections(rows):
+        alignment = ("---", *("--:" for _ in section.header[1:]))
+        table = [section.header, alignment, *section.lines]
+        parts.append(f"## {section.title}")
+        parts.append("\n".join("| " + " | ".join(map(_escape, line)) + " |" for line in table))
+    parts.append("\n".join(f"- {line}" for line in [*legend(rows), *notes]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _escape(cell: str) -> str:
+    return cell.replace("|", "\\|")
+
+
+def to_records(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Rows as flat records: the columns of the csv, and `rows` of the JSON. Times in seconds."""
+    return [_record(row) for row in rows]
+
+
+def _record(row: Row) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "scene": row.scene,
+        "protocol": row.protocol,
+        "method": row.method,
+        "label": row.label,
+        "steps": row.steps,
+        "seeds": len(row.seeds),
+    }
+    spreads = {name: row.quantities.get(name) for name in QUANTITIES} | {"psnr_gain": row.gain}
+    for name, spread in spreads.items():
+        record[f"{name}_mean"] = None if spread is None else spread.mean
+        record[f"{name}_std"] = None if spread is None else spread.std
+    record |= {"lpips_network": row.lpips_network, "device": row.device}
+    return record | {f"paper_{name}": (row.published or {}).get(name) for name in PUBLISHED}
+
+
+def to_csv(rows: Sequence[Row]) -> str:
+    """One line per row, plain numbers, empty where there is none."""
+    records = to_records(rows)
+    if not records:
+        return ""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(records[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return text.getvalue()

@@ -1,0 +1,139 @@
+"""The list of runs: methods, variants, scenes, and what is refused before anything is trained."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from wildgs.cli.bench_plan import LABELS, METHODS, find_phototourism, make_jobs, method_config, parse_variant
+from wildgs.config import RunConfig, write_config
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.model.wildgs import Ablation
+
+BASE = RunConfig(Path())
+
+
+def test_every_ablation_is_a_method_with_a_label():
+    ablations = {method.removeprefix("without-") for method in METHODS if method.startswith("without-")}
+    assert ablations == set(get_args(Ablation))
+    assert list(LABELS) == list(METHODS)
+    for method in METHODS:
+        config = method_config(method, BASE)
+        assert config.method == ("3dgs" if method == "3dgs" else "wildgs")
+        expected = (method.removeprefix("without-"),) if method.startswith("without-") else ()
+        assert config.model.without == expected
+    assert method_config("wildgs-half-steps", BASE).train.steps == BASE.train.steps // 2
+
+
+@pytest.mark.parametrize(
+    ("text", "entries"),
+    [
+        ("slow:train.optimizer.networks=2e-3", {"train.optimizer.networks": 0.002}),
+        (
+            "thin:model.wrapping.widths=[8,16],train.steps=5",
+            {"model.wrapping.widths": [8, 16], "train.steps": 5},
+        ),
+        ("bare:model.without=[local, mask]", {"model.without": ["local", "mask"]}),
+        ("plain:method=3dgs", {"method": "3dgs"}),
+        ("no-depth:data.use_depth=false", {"data.use_depth": False}),
+    ],
+)
+def test_variants_are_read(text, entries):
+    variant = parse_variant(text)
+    assert variant.name == text.partition(":")[0]
+    assert variant.entries == entries
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("nothing", "expected NAME:KEY=VALUE"),
+        ("../up:train.steps=1", "expected NAME"),
+        ("wildgs:train.steps=1", "is a method"),
+        ("x:train.steps", "is not KEY=VALUE"),
+        ("x:", "is not KEY=VALUE"),
+        ("x:train.seed=3", "--seeds"),
+        ("x:scene=there", "SCENE"),
+    ],
+)
+def test_other_variants_are_refused(text, said):
+    with pytest.raises(UserError, match=said):
+        parse_variant(text)
+
+
+def test_jobs_differ_in_what_they_should(landmark: Path, tmp_path: Path):
+    variants = [parse_variant("slow:train.optimizer.networks=1e-4")]
+    jobs = make_jobs([landmark], BASE, ["3dgs", "wildgs"], variants, (0, 7), tmp_path)
+    assert [(job.seed, job.method) for job in jobs] == [
+        (seed, method) for seed in (0, 7) for method in ("3dgs", "wildgs", "slow")
+    ]
+    assert len({job.folder for job in jobs}) == 6
+    slow = jobs[-1]
+    assert slow.folder == tmp_path / "scene" / "slow" / "seed_7"
+    assert slow.config.train.seed == 7
+    assert slow.config.scene == landmark.resolve()
+    optimizer = replace(BASE.train.optimizer, networks=1e-4)
+    assert slow.config.train == replace(BASE.train, seed=7, optimizer=optimizer)
+
+
+@pytest.mark.parametrize(
+    ("variants", "seeds", "said"),
+    [
+        (("a:train.stebs=1",), (0,), "unknown entry 'stebs'"),
+        (("a:train.steps=lots",), (0,), "--variant a: config.train.steps"),
+        (("a:train.steps=1", "a:train.steps=2"), (0,), "a is there twice"),
+        ((), (0, 0), "0 is there twice"),
+    ],
+)
+def test_mistakes_are_found_before_training(landmark, tmp_path, variants, seeds, said):
+    with pytest.raises(UserError, match=said):
+        make_jobs([landmark], BASE, ["wildgs"], [parse_variant(v) for v in variants], seeds, tmp_path)
+
+
+def test_two_scenes_of_one_name_are_refused(landmark, tmp_path):
+    with pytest.raises(UserError, match="scene is there twice"):
+        make_jobs([landmark, tmp_path / "scene"], BASE, ["wildgs"], [], (0,), tmp_path)
+
+
+def test_runs_with_other_settings_are_not_mixed_in(landmark, tmp_path):
+    (job,) = make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
+    job.folder.mkdir(parents=True)
+    write_config(job.folder / "config.yaml", job.config)
+    shorter = replace(BASE, train=replace(BASE.train, steps=10))
+    with pytest.raises(UserError, match=r"train\.steps: 30000 there, 10 asked for"):
+        make_jobs([landmark], shorter, ["wildgs"], [], (0,), tmp_path)
+    make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
+
+
+def test_a_budget_lowered_for_memory_is_no_other_setting(landmark, tmp_path):
+    (job,) = make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
+    job.folder.mkdir(parents=True)
+    density = replace(BASE.train.density, max_gaussians=1000)
+    lowered = replace(job.config, train=replace(job.config.train, density=density))
+    write_config(job.folder / "config.yaml", lowered)
+    make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
+
+
+def test_preset_finds_its_scenes_in_the_papers_order(tmp_path):
+    for name in ("trevi_fountain", "brandenburg_gate", "lincoln_memorial"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "split.tsv").touch()
+    with pytest.warns(WildGSWarning, match="no sacre_coeur"):
+        scenes = find_phototourism([tmp_path])
+    assert [scene.name for scene in scenes] == ["brandenburg_gate", "trevi_fountain"]
+    with pytest.warns(WildGSWarning, match="sacre_coeur, trevi_fountain"):
+        assert find_phototourism([tmp_path / "brandenburg_gate"]) == (tmp_path / "brandenburg_gate",)
+
+
+def test_preset_without_scenes_or_split_says_what_to_do(tmp_path):
+    with pytest.raises(UserError, match="none of the preset's scenes"):
+        find_phototourism([tmp_path])
+    (tmp_path / "sacre_coeur").mkdir()
+    with (
+        pytest.warns(WildGSWarning, match="no brandenburg_gate"),
+        pytest.raises(UserError, match="no split; put NeRF-W's"),
+    ):
+        find_phototourism([tmp_path])
