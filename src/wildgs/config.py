@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import types
 import typing
 from dataclasses import dataclass, field
@@ -99,8 +100,22 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
 
 
 def write_config(path: Path, config: RunConfig) -> None:
-    """Writes YAML."""
-    path.write_text(yaml.safe_dump(to_plain(config), sort_keys=False), encoding="utf-8")
+    """Writes YAML, aside and renamed: a reader never sees half of it.
+
+    Raises:
+        UserError: The disk is full, or the folder cannot be written to.
+    """
+    aside = path.with_name(path.name + ".partial")
+    try:
+        with aside.open("w", encoding="utf-8") as file:
+            yaml.safe_dump(to_plain(config), file, sort_keys=False)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be written ({error}); make room or choose another --output"
+        ) from error
 
 
 def read_config(path: Path) -> RunConfig:
@@ -111,6 +126,6 @@ def read_config(path: Path) -> RunConfig:
     """
     try:
         plain = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # a date that is none: ValueError
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
     return from_plain(RunConfig, plain, str(path))

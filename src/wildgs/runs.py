@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import filelock
 import torch
 
 from wildgs.config import RunConfig, read_config, to_plain, write_config
 from wildgs.data import Alignment, Scene, load_scene
-from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_checkpoint, save_checkpoint
+from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.trainer import Trainer
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
 
 CONFIG_FILE = "config.yaml"
 CHECKPOINT_FOLDER = "checkpoints"
+LOCK_FILE = ".lock"
 
 
 def default_device() -> torch.device:
@@ -66,20 +70,86 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
     if checkpoint is None:
         raise UserError(f"{folder} has no checkpoint yet; let `wildgs train` finish or resume it")
     method = restore_method(config.method, config.model, checkpoint.method)
-    return Run(
-        folder=folder,
-        config=config,
-        method=method.to(device or default_device()).eval(),
-        step=int(checkpoint.state["progress.step"]),
-        train_seconds=float(checkpoint.state["progress.seconds"]),
-        alignment=Alignment.from_dict(checkpoint.header["alignment"]),
-    )
+    with _complete(folder):
+        return Run(
+            folder=folder,
+            config=config,
+            method=method.to(device or default_device()).eval(),
+            step=int(checkpoint.state["progress.step"]),
+            train_seconds=float(checkpoint.state["progress.seconds"]),
+            alignment=Alignment.from_dict(checkpoint.header["alignment"]),
+        )
 
 
-def newest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint of a run folder, or None."""
-    checkpoints = list_checkpoints(folder / CHECKPOINT_FOLDER)
-    return load_checkpoint(checkpoints[-1]) if checkpoints else None
+@contextmanager
+def _complete(folder: Path) -> Iterator[None]:
+    """Entries that a checkpoint lacks are a user's mistake: a file of another program, or another version."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        first = (str(error).splitlines() or [""])[0]
+        raise UserError(
+            f"{folder}: its checkpoint is not one of this version's training ({type(error).__name__}: {first})"
+        ) from error
+
+
+@contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """Keeps other trainings out of a run folder while the block runs; the lock dies with the process.
+
+    Raises:
+        UserError: Another process trains into it, or it cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / LOCK_FILE, timeout=0)
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise UserError(
+            f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
+        ) from error
+    except NotImplementedError:  # a network disk without locks: better unlocked than not at all
+        yield
+        return
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
+    """The newest checkpoint of a run folder that is whole, or None; see `load_newest`."""
+    return load_newest(folder / CHECKPOINT_FOLDER, set_aside=set_aside)
+
+
+def refuse_trained(folder: Path) -> None:
+    """Protects a run from being trained over.
+
+    Raises:
+        UserError: The folder already holds one.
+    """
+    if list_checkpoints(folder / CHECKPOINT_FOLDER):
+        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+
+
+def prepare_training(folder: Path, config: RunConfig, scene: Scene, *, resume: bool) -> Trainer:
+    """A trainer at step 0, or at the newest whole checkpoint of a run that may have a lower budget now.
+
+    Raises:
+        UserError: As `start_training` and `resume_training` do.
+    """
+    if not resume:
+        return start_training(folder, config, scene)
+    stored = read_config(folder / CONFIG_FILE)
+    if config != stored:
+        write_config(folder / CONFIG_FILE, config)
+    trainer = resume_training(folder, scene)
+    if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
+        # Saved at once, so that a run killed from here on goes on from this very state.
+        save_run(folder, trainer, config, scene.alignment)
+    return trainer
 
 
 def start_training(
@@ -90,28 +160,46 @@ def start_training(
     Raises:
         UserError: The folder already holds a trained run.
     """
-    if list_checkpoints(folder / CHECKPOINT_FOLDER):
-        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+    refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
     torch.manual_seed(config.train.seed)
-    method = create_method(config.method, config.model, scene.points, scene.point_colors)
+    points, colors = _within_budget(scene, config)
+    method = create_method(config.method, config.model, points, colors)
     return Trainer(method.to(device or default_device()), scene, config.train)
 
 
+def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """The scene's points, or a random choice of them where they are more than the budget."""
+    count, budget = len(scene.points), config.train.density.max_gaussians
+    if count <= budget:
+        return scene.points, scene.point_colors
+    warnings.warn(
+        f"the scene has {count:,} points; training starts from {budget:,} of them (--max-gaussians)",
+        WildGSWarning,
+        stacklevel=3,
+    )
+    generator = torch.Generator().manual_seed(config.train.seed)
+    chosen = torch.randperm(count, generator=generator)[:budget].sort().values
+    return scene.points[chosen], scene.point_colors[chosen]
+
+
 def resume_training(folder: Path, scene: Scene, device: torch.device | None = None) -> Trainer:
-    """A trainer at the newest checkpoint, with the configuration that the run began with.
+    """A trainer at the newest whole checkpoint, with the configuration that the run began with.
+
+    A run that was killed before its first checkpoint starts at step 0 again.
 
     Raises:
-        UserError: The folder holds no run, or no checkpoint yet.
+        UserError: The folder holds no run, or no checkpoint that is whole.
     """
     config = read_config(folder / CONFIG_FILE)
-    checkpoint = newest_checkpoint(folder)
+    checkpoint = newest_checkpoint(folder, set_aside=True)
     if checkpoint is None:
-        raise UserError(f"{folder} has no checkpoint to resume from; leave --resume out")
+        return start_training(folder, config, scene, device)
     method = restore_method(config.method, config.model, checkpoint.method)
-    trainer = Trainer(method.to(device or default_device()), scene, config.train)
-    trainer.restore(checkpoint.state)
+    with _complete(folder):
+        trainer = Trainer(method.to(device or default_device()), scene, config.train)
+        trainer.restore(checkpoint.state)
     return trainer
 
 

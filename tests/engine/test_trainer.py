@@ -90,13 +90,21 @@ def differences(expected: dict[str, torch.Tensor], got: dict[str, torch.Tensor])
     return [n for n in expected if n != "progress.seconds" and not torch.equal(expected[n], got[n])]
 
 
-def test_resumed_baseline_ends_in_the_same_bits(
-    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path
+@pytest.mark.parametrize("method", ["3dgs", "wildgs"])
+def test_a_resumed_run_ends_in_the_same_bits(
+    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path, method: MethodName
 ) -> None:
-    whole = trainer_for(wall_scene, tiny_model, 120, "3dgs", schedule=SCHEDULE)
+    """Judged only where two undisturbed runs end in the same bits."""
+    whole = trainer_for(wall_scene, tiny_model, 120, method, schedule=SCHEDULE)
     whole.run([lambda r: save_checkpoint(tmp_path, r.step, whole.state(), {}) if r.step == 70 else None])
+    again = trainer_for(wall_scene, tiny_model, 120, method, schedule=SCHEDULE)
+    again.run()
+    if unlike := differences(whole.state(), again.state()):
+        assert method == "wildgs"
+        pytest.skip(f"not reproducible from run to run here: {unlike[0]} and {len(unlike) - 1} more")
     checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
-    resumed = Trainer(restore_method("3dgs", tiny_model, checkpoint.method), wall_scene, whole.config)
+    torch.manual_seed(123)  # whatever happened before must not matter
+    resumed = Trainer(restore_method(method, tiny_model, checkpoint.method), wall_scene, whole.config)
     resumed.restore(checkpoint.state)
     assert resumed.step == 70
     resumed.run()
@@ -145,20 +153,6 @@ def test_recorder_leaves_lines_and_a_board(
     board.Reload()
     assert "train/total" in board.Tags()["scalars"]
     assert {"train/photo", "train/render", "train/visibility", "train/depth"} <= set(board.Tags()["images"])
-
-
-def test_checkpoints_keep_two_and_refuse_damage(tmp_path: Path) -> None:
-    for step in (1, 2, 3):
-        save_checkpoint(tmp_path, step, {"x": torch.full((4,), float(step))}, {"note": "ä"})
-    kept = list_checkpoints(tmp_path)
-    assert [path.name for path in kept] == ["step_00000002.safetensors", "step_00000003.safetensors"]
-    assert sorted(tmp_path.iterdir()) == kept, "nothing half written"
-    checkpoint = load_checkpoint(kept[-1])
-    assert checkpoint.header == {"note": "ä"}
-    assert torch.equal(checkpoint.state["x"], torch.full((4,), 3.0))
-    kept[-1].write_bytes(kept[-1].read_bytes()[:40])
-    with pytest.raises(UserError, match="not a readable checkpoint"):
-        load_checkpoint(kept[-1])
 
 
 def test_missing_pretrained_weights_do_not_stop_training(wall_scene: Scene, tiny_model: WildGSConfig) -> None:

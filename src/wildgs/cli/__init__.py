@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import sys
 import warnings
 
@@ -20,11 +21,12 @@ VERBS = {
     "doctor": "what works on this machine, and how to get what does not",
 }
 USER_ERROR = 2
+logging.getLogger("wildgs").addHandler(logging.NullHandler())  # or Python prints what is logged a second time
 INTERRUPTED = 130
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 interrupted."""
+    """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 or 143 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
@@ -39,9 +41,9 @@ def main(arguments: list[str] | None = None) -> None:
         _run(verb, rest)
     except UserError as error:
         _fail(" ".join(str(error).split()))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    except KeyboardInterrupt as interrupt:
+        print(str(interrupt) or "interrupted", file=sys.stderr)
+        sys.exit(getattr(interrupt, "code", INTERRUPTED))
 
 
 def _run(verb: str, arguments: list[str]) -> None:
@@ -57,7 +59,9 @@ def _run(verb: str, arguments: list[str]) -> None:
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     """One line on stderr; other libraries' warnings are not the user's business."""
     if issubclass(category, WildGSWarning):
-        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+        line = " ".join(str(message).split())
+        logging.getLogger("wildgs").warning(line)
+        print(f"warning: {line}", file=sys.stderr)
 
 
 def _fail(message: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from wildgs.cli.eval import evaluate_run, print_scores
 from wildgs.cli.progress import console, counting
 from wildgs.cli.showcase import Scores, write_showcase
-from wildgs.cli.train import read_scene, train_to_end
+from wildgs.cli.train import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig
@@ -17,7 +17,7 @@ from wildgs.errors import UserError
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
-from wildgs.runs import load_run, start_training
+from wildgs.runs import load_run
 
 TITLES: dict[MethodName, str] = {"wildgs": "Wild-GS", "3dgs": "3DGS"}
 SUMMARY = (
@@ -68,7 +68,7 @@ def run(command: Command) -> None:
         config = RunConfig(folder.resolve(), method, model=MODEL, train=_training(command.steps))
         scene = read_scene(config)
         target = command.output / method
-        train_to_end(target, config, scene, start_training(target, config, scene))
+        train_or_go_on(target, config, scene)
         loaded = load_run(target)
         scores: Scores = {
             "full": evaluate_run(loaded, scene, "full"),

@@ -21,11 +21,15 @@ State = Literal["works", "missing", "broken"]
 class Command:
     """Say what works on this machine and how to get what does not. Downloads nothing.
 
-    Example: wildgs doctor --json
+    Example: wildgs doctor --report --run runs/gate
     """
 
     json: bool = False
     """Print JSON instead of a table."""
+    report: bool = False
+    """Print what a bug report needs, without the names of user, machine and home folder."""
+    run: Path | None = None
+    """Run folder whose configuration and last log lines go into the report."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,11 @@ def run(command: Command) -> None:
     checks = examine()
     if command.json:
         print(json.dumps([asdict(check) for check in checks], indent=2))
+        return
+    if command.report or command.run is not None:
+        from wildgs.cli.bug_report import write_report
+
+        print(write_report([(check.name, check.state, check.detail) for check in checks], command.run))
         return
     _print_table(checks)
 

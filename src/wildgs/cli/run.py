@@ -11,14 +11,14 @@ from wildgs.cli.eval import evaluate_run, print_scores
 from wildgs.cli.progress import console, counting
 from wildgs.cli.sfm import print_report, reconstruct_with_progress
 from wildgs.cli.showcase import Scores, write_showcase
-from wildgs.cli.train import read_scene, train_to_end
+from wildgs.cli.train import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
 from wildgs.data.photos import SfmConfig
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
-from wildgs.runs import default_device, load_run, start_training
+from wildgs.runs import default_device, load_run
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
@@ -43,6 +43,8 @@ class Command:
     """Training steps."""
     downscale: float | None = None
     """Divides the photos' width and height."""
+    max_gaussians: int | None = None
+    """Most Gaussians; follows the machine unless given."""
     holdout: int = 8
     """Every n-th photo is held out for scoring; 0 = none."""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
@@ -57,7 +59,7 @@ def run(command: Command) -> None:
         print_report(reconstruct_with_progress(command.photos, folder, command.sfm))
         estimate_depth(folder)
     config, scene = _configure(command, folder)
-    train_to_end(command.output, config, scene, start_training(command.output, config, scene))
+    train_or_go_on(command.output, config, scene)
     loaded = load_run(command.output)
     scores: Scores = {}
     if scene.test_views:
@@ -83,7 +85,8 @@ def _configure(command: Command, folder: Path) -> tuple[RunConfig, Scene]:
     steps = command.steps or (GPU_STEPS if gpu else CPU_STEPS)
     downscale = command.downscale or _downscale_for(folder, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE)
     data = DataConfig(downscale=downscale, holdout=command.holdout)
-    budget = DensityConfig() if gpu else DensityConfig(max_gaussians=CPU_MAX_GAUSSIANS)
+    most = command.max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
+    budget = DensityConfig(max_gaussians=most)
     config = RunConfig(folder.resolve(), "wildgs", data, train=TrainConfig(steps=steps, density=budget))
     return config, read_scene(config)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -9,16 +11,29 @@ from typing import Annotated
 import torch
 import tyro
 
+from wildgs.cli.interrupts import InterruptedTrainingError, StopOnSignal
+from wildgs.cli.logs import logger, run_log
 from wildgs.cli.progress import TrainingProgress, console, counting
 from wildgs.config import RunConfig, read_config
 from wildgs.data import DataConfig, Scene, load_scene
+from wildgs.engine.autosave import Autosave, AutosaveConfig
+from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
-from wildgs.runs import CONFIG_FILE, resume_training, save_run, start_training
+from wildgs.runs import (
+    CONFIG_FILE,
+    default_device,
+    lock_run,
+    prepare_training,
+    refuse_trained,
+    save_run,
+)
 
-CHECKPOINT_EVERY = 1000
+RETRY_SHARE = 0.8
+"""Of the Gaussians with which memory ran out, for the second try."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +51,12 @@ class Command:
     """wildgs, or 3dgs for plain 3D Gaussian Splatting on the same engine."""
     resume: bool = False
     """Go on from the run's newest checkpoint, with the configuration it began with."""
+    max_gaussians: int | None = None
+    """Most Gaussians; by default what `--density.max-gaussians` says, or less where memory is short."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    autosave: Annotated[AutosaveConfig, tyro.conf.arg(name="")] = field(default_factory=AutosaveConfig)
 
 
 def run(command: Command) -> None:
@@ -46,12 +64,16 @@ def run(command: Command) -> None:
     config = RunConfig(command.scene.resolve(), command.method, command.data, command.model, command.train)
     if command.resume:
         config = replace(read_config(command.output / CONFIG_FILE), scene=config.scene)
-    scene = read_scene(config)
-    if command.resume:
-        trainer = resume_training(command.output, scene)
-    else:
-        trainer = start_training(command.output, config, scene)
-    train_to_end(command.output, config, scene, trainer)
+        if command.data.image_cache != DataConfig().image_cache:  # it has no influence on the result
+            config = replace(config, data=replace(config.data, image_cache=command.data.image_cache))
+    if command.max_gaussians is not None:
+        config = with_budget(config, command.max_gaussians)
+    with lock_run(command.output):
+        scene = read_scene(config)
+        if not command.resume:
+            refuse_trained(command.output)
+            config = plan_memory(config, scene, explicit=command.max_gaussians is not None)
+        train_within_memory(command.output, config, scene, resume=command.resume, autosave=command.autosave)
 
 
 def read_scene(config: RunConfig) -> Scene:
@@ -65,27 +87,128 @@ def read_scene(config: RunConfig) -> Scene:
     return scene
 
 
-def train_to_end(folder: Path, config: RunConfig, scene: Scene, trainer: Trainer) -> None:
-    """Trains what is left, recording and saving; an interrupt saves first."""
+def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
+    """The same run with another budget of Gaussians.
+
+    Raises:
+        UserError: The budget is below 1.
+    """
+    if max_gaussians < 1:
+        raise UserError(f"--max-gaussians {max_gaussians}: must be 1 or more")
+    density = replace(config.train.density, max_gaussians=max_gaussians)
+    return replace(config, train=replace(config.train, density=density))
+
+
+def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> RunConfig:
+    """The run with a budget of Gaussians that fits into memory, with a word where it was lowered.
+
+    Raises:
+        UserError: It cannot fit.
+    """
+    wish = config.train.density.max_gaussians
+    budget, word = plan_budget(config.method, scene, wish, default_device(), explicit=explicit)
+    if word is not None:
+        warnings.warn(word, WildGSWarning, stacklevel=2)
+    return config if budget == wish else with_budget(config, budget)
+
+
+def train_or_go_on(folder: Path, config: RunConfig, scene: Scene) -> None:
+    """Trains a run that `config` describes, from where an earlier, interrupted call left it.
+
+    Raises:
+        UserError: The folder holds a run of another configuration.
+    """
+    with lock_run(folder):
+        resume = (folder / CONFIG_FILE).is_file()
+        if not resume:
+            config = plan_memory(config, scene)
+        else:
+            stored = read_config(folder / CONFIG_FILE)
+            if with_budget(stored, 1) != with_budget(config, 1):
+                raise UserError(
+                    f"{folder} holds a run with other settings; choose another --output, or go on with that one "
+                    f"by `wildgs train {config.scene} --output {folder} --resume`"
+                )
+            config = stored
+        train_within_memory(folder, config, scene, resume=resume)
+
+
+def train_within_memory(
+    folder: Path, config: RunConfig, scene: Scene, *, resume: bool, autosave: AutosaveConfig | None = None
+) -> None:
+    """Trains to the end; where the GPU's memory runs out, once more from the newest checkpoint with less.
+
+    Raises:
+        UserError: Memory ran out twice.
+    """
+    lowered = _train_unless_full(folder, config, scene, resume, autosave)
+    if lowered is None:
+        return
+    gc.collect()
+    torch.cuda.empty_cache()
+    budget = lowered.train.density.max_gaussians
+    message = (
+        f"the GPU's memory ran out; going on from the newest checkpoint with at most {budget:,} Gaussians"
+    )
+    warnings.warn(message, WildGSWarning, stacklevel=2)
+    if _train_unless_full(folder, lowered, scene, True, autosave) is not None:
+        raise UserError(
+            "the GPU's memory ran out again: go on with --resume and a lower --max-gaussians, or start anew with a "
+            "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
+        )
+
+
+def _train_unless_full(
+    folder: Path, config: RunConfig, scene: Scene, resume: bool, autosave: AutosaveConfig | None
+) -> RunConfig | None:
+    """Trains to the end, or returns the configuration to try next.
+
+    What ran out of memory is freed when this returns: nothing else holds the trainer.
+    """
+    trainer: Trainer | None = None
+    try:
+        trainer = prepare_training(folder, config, scene, resume=resume)
+        train_to_end(folder, config, scene, trainer, autosave)
+    except torch.OutOfMemoryError:
+        count = len(scene.points) if trainer is None else len(trainer.method.gaussians)
+        budget = min(count, config.train.density.max_gaussians)
+        return with_budget(config, max(1, int(RETRY_SHARE * budget)))
+    return None
+
+
+def train_to_end(
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    trainer: Trainer,
+    autosave: AutosaveConfig | None = None,
+) -> None:
+    """Trains what is left, recording and saving.
+
+    Only whole steps are saved: whatever else breaks off a step leaves the newest checkpoint as it was.
+
+    Raises:
+        InterruptedTrainingError: A signal came; the last step is saved.
+    """
     label = f"training {config.method}"
-    saved = trainer.step
-
-    def save() -> None:
-        nonlocal saved
-        if trainer.step > saved:
-            save_run(folder, trainer, config, scene.alignment)
-            saved = trainer.step
-
+    saver = Autosave(
+        lambda: save_run(folder, trainer, config, scene.alignment), autosave or AutosaveConfig(), trainer.step
+    )
     with (
-        Recorder(folder) as recorder,
+        run_log(folder),
+        Recorder(folder, step=trainer.step) as recorder,
         TrainingProgress(label, config.train.steps, trainer.step) as progress,
+        StopOnSignal() as stop,
     ):
+        logger.info("%s from step %d of %d", label, trainer.step, config.train.steps)
         try:
-            trainer.run(
-                [recorder, progress, lambda report: save() if report.step % CHECKPOINT_EVERY == 0 else None]
-            )
-        finally:
-            save()
+            trainer.run([recorder, progress, saver, stop])
+        except InterruptedTrainingError as interrupt:
+            saver.save(trainer.step)
+            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
+            raise
+        saver.save(trainer.step)
+        logger.info("done: %d steps in %.0f s", trainer.step, trainer.seconds)
     minutes = trainer.seconds / 60
     console.print(
         f"{label}: {trainer.step} steps in {minutes:.1f} min on {_device_name(trainer.device)}, "

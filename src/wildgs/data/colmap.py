@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import pycolmap
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from wildgs.errors import UserError
+from wildgs.data.colmap_files import ImageRecord, ModelFileError, ModelRecords, PointRecords, read_records
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.geometry.rotation import quats_to_rotations
 
 LAYOUTS = (
     ("sparse/0", "images"),
@@ -22,6 +25,9 @@ LAYOUTS = (
     ("dense/sparse", "dense/images"),
 )
 """Folders of a model and of its photos, relative to the scene; the first that holds a model counts."""
+
+MAX_COORDINATE = 1e12
+"""Poses and points beyond it (in model units) are damage: single precision ends soon after."""
 
 MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
 
@@ -88,76 +94,108 @@ def read_model(root: Path) -> ColmapModel:
     """
     folder, images_dir = find_model(root)
     try:
-        reconstruction = pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises ValueError, RuntimeError, MemoryError, ... on broken files
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{folder}: the COLMAP model cannot be read ({reason}); make it anew") from error
-
-    registered = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
-    if not registered:
-        raise UserError(
-            f"{folder}: the COLMAP model holds no photo with a pose; run `wildgs sfm` on the photos"
-        )
-    point_ids, points, colors = _read_points(reconstruction)
-    if len(points) == 0:
+        records = read_records(folder)
+    except ModelFileError as error:
+        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
+    registered = _usable(records, folder)
+    with np.errstate(invalid="ignore"):
+        finite = (np.abs(records.points.xyz) < MAX_COORDINATE).all(axis=1)
+    if not finite.any():
         raise UserError(
             f"{folder}: the COLMAP model holds no points, and training starts from them; triangulate it"
         )
-
     viewmats = {image.image_id: _viewmat(image) for image in registered}
-    depths = _median_depths(reconstruction, point_ids, points, viewmats)
+    depths = _median_depths(records.points, finite, viewmats)
     images = tuple(
         ColmapImage(
             name=_checked_name(image.name, folder),
-            # A copy: pycolmap's own belongs to the reconstruction and dies with it.
-            camera=pycolmap.Camera(image.camera.todict()),
+            camera=records.cameras[image.camera_id],
             viewmat=torch.from_numpy(viewmats[image.image_id]),
             median_depth=depths.get(image.image_id),
         )
         for image in registered
     )
+    _refuse_repeated([image.name for image in images], folder)
+    points, colors = records.points.xyz[finite], records.points.rgb[finite]
     return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors))
+
+
+def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
+    """Photos with a camera and a pose that mean something, by name; the others are named in a warning."""
+    images = sorted(records.images, key=lambda image: image.name)
+    if not images:
+        raise UserError(
+            f"{folder}: the COLMAP model holds no photo with a pose; run `wildgs sfm` on the photos"
+        )
+    if len({image.image_id for image in images}) != len(images):
+        raise UserError(f"{folder}: two photos of the COLMAP model have one id; make it anew")
+    faults = {image.name: fault for image in images if (fault := _fault(image, records.cameras))}
+    good = [image for image in images if image.name not in faults]
+    described = describe_names([f"{name!r} ({fault})" for name, fault in faults.items()])
+    if not good:
+        raise UserError(f"{folder}: no photo of the COLMAP model can be used: {described}; make it anew")
+    if faults:
+        warnings.warn(
+            f"{folder}: {len(faults)} photos cannot be used and are left out: {described}",
+            WildGSWarning,
+            stacklevel=3,
+        )
+    return good
+
+
+def _fault(image: ImageRecord, cameras: dict[int, Any]) -> str | None:
+    """Why a photo cannot be used, or None."""
+    camera = cameras.get(image.camera_id)
+    if camera is None:
+        return f"there is no camera {image.camera_id}"
+    params = np.array(camera.params)
+    if not np.isfinite(params).all() or not all(params[i] > 0 for i in camera.focal_length_idxs()):
+        return "its camera's parameters make no sense"
+    pose = np.array([*image.quat, *image.translation])
+    if not np.isfinite(pose).all() or np.abs(pose).max() > MAX_COORDINATE:
+        return "its pose is no finite number"
+    return None if np.linalg.norm(image.quat) > 1e-12 else "its rotation is zero"
+
+
+def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
+    repeated = sorted({a for a, b in itertools.pairwise(names) if a == b})
+    if repeated:
+        raise UserError(f"{folder}: the photo {repeated[0]!r} is in the COLMAP model twice; make it anew")
 
 
 def _checked_name(name: str, folder: Path) -> str:
     """A photo's name that stays within the image folder: other files are found, and written, by it."""
     path = PurePosixPath(name.replace("\\", "/"))
-    if path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0]):
+    outside = path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0])
+    if outside or not path.name or any(character < " " for character in name):
         raise UserError(
             f"{folder}: the photo {name!r} lies outside the image folder; give it a name within it"
         )
     return str(path)
 
 
-def _viewmat(image: Any) -> np.ndarray:
+def _viewmat(image: ImageRecord) -> np.ndarray:
+    quat = torch.tensor(image.quat, dtype=torch.float64)
     viewmat = np.eye(4)
-    viewmat[:3] = image.cam_from_world().matrix()
+    viewmat[:3, :3] = quats_to_rotations(quat[None] / quat.norm())[0].numpy()
+    viewmat[:3, 3] = image.translation
     return viewmat
 
 
-def _read_points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # By id: the order in pycolmap's hash map may differ from one machine to the next.
-    items = sorted(reconstruction.points3D.items())
-    ids = np.array([point_id for point_id, _ in items], dtype=np.uint64)
-    points = np.array([point.xyz for _, point in items], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([point.color for _, point in items], dtype=np.uint8).reshape(-1, 3)
-    finite = np.isfinite(points).all(axis=1)
-    return ids[finite], points[finite], colors[finite]
-
-
 def _median_depths(
-    reconstruction: Any, ids: np.ndarray, points: np.ndarray, viewmats: dict[int, np.ndarray]
+    points: PointRecords, finite: np.ndarray, viewmats: dict[int, np.ndarray]
 ) -> dict[int, float]:
     """Median depth of each photo's own points (those in its tracks), model units."""
-    seen: dict[int, list[int]] = {}
-    for index, point_id in enumerate(ids):
-        for element in reconstruction.points3D[int(point_id)].track.elements:
-            seen.setdefault(element.image_id, []).append(index)
+    rows, photos = points.track_point, points.track_image
+    known = finite[rows]
+    rows, photos = rows[known], photos[known]
+    order = np.argsort(photos, kind="stable")
+    ids, starts = np.unique(photos[order], return_index=True)
     depths = {}
-    for image_id, indices in seen.items():
+    for image_id, seen in zip(ids.tolist(), np.split(rows[order], starts[1:]), strict=True):
         if image_id in viewmats:
             row = viewmats[image_id][2]
-            depth = points[indices] @ row[:3] + row[3]
+            depth = points.xyz[seen] @ row[:3] + row[3]
             if (depth > 0).any():
                 depths[image_id] = float(np.median(depth[depth > 0]))
     return depths

@@ -20,6 +20,9 @@ ASPECT_TOLERANCE = 0.01
 MAX_IMAGE_PIXELS = 250_000_000
 """Pictures with more pixels are refused unread: a small file can unpack to more than the memory holds."""
 
+FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000", "AVIF", "HEIF")
+"""What is decoded, whatever a file's name says. Others that Pillow knows start programs (EPS runs Ghostscript)."""
+
 _open_lock = threading.Lock()
 
 
@@ -55,7 +58,7 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
         with _open_lock:
             previous, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
-                image = Image.open(path)
+                image = Image.open(path, formats=_formats())
             finally:
                 Image.MAX_IMAGE_PIXELS = previous
     except FileNotFoundError as error:
@@ -63,10 +66,21 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
     except Exception as error:  # Pillow's plugins raise nearly anything on broken headers
         raise UnreadableImageError("not a readable picture") from error
     width, height = image.size
+    if width * height == 0:
+        image.close()
+        raise UnreadableImageError("it has no pixels")
     if width * height > max_pixels:
         image.close()
-        raise UnreadableImageError(f"{width}x{height} pixels exceed the limit of {max_pixels}")
+        raise UnreadableImageError(
+            f"{width}x{height} pixels exceed the limit of {max_pixels} (--max-image-pixels)"
+        )
     return image
+
+
+def _formats() -> list[str]:
+    """Those of `FORMATS` that this Pillow can read."""
+    Image.init()
+    return [name for name in FORMATS if name in Image.OPEN]
 
 
 def _load(image: Image.Image) -> None:

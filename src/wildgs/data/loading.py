@@ -6,12 +6,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from wildgs.data.alignment import align_world
 from wildgs.data.colmap import ColmapImage, describe_names, read_model
+from wildgs.data.image_cache import DECODERS, CachedPictures, ImageCache, available_memory, parse_bytes
 from wildgs.data.images import MAX_IMAGE_PIXELS, UnreadableImageError
 from wildgs.data.phototourism import assign_splits
 from wildgs.data.pictures import PhotoFiles
@@ -20,8 +22,8 @@ from wildgs.data.undistort import PixelGrid
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 
-DECODERS = 4
-"""Threads that decode photos; Pillow works without Python's lock."""
+CACHE_SHARE = 0.5
+"""Share of the free memory that decoded photos take at most, whatever the limit."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class DataConfig:
     """Read the depth prior in depth/."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
     """Pictures with more pixels are left out unread."""
+    image_cache: str = "4GB"
+    """Memory for decoded photos; those beyond it are decoded again at their turn. No influence on the result."""
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
@@ -45,12 +49,17 @@ class DataConfig:
             raise UserError(f"downscale {self.downscale}: must be 1 (full size) or more")
         if self.holdout < 0 or self.holdout == 1:
             raise UserError(f"holdout {self.holdout}: must be 0 (all photos train) or at least 2")
+        if self.max_image_pixels < 1:
+            raise UserError(f"max-image-pixels {self.max_image_pixels}: must be above 0")
+        parse_bytes(self.image_cache)
 
 
 def load_scene(
     root: Path, config: DataConfig | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> Scene:
-    """Read a COLMAP scene: cameras, points, split, photos (decoded once, kept as 8 bits), masks, depth.
+    """Read a COLMAP scene: cameras, points, split, photos (8 bits, within `image_cache`), masks, depth.
+
+    Every photo is decoded once, so that broken ones are known before training begins.
 
     Args:
         root: Folder with `images/` and `sparse/0/` (or `sparse/`, `dense/sparse/`), optionally a `*.tsv`
@@ -105,10 +114,11 @@ def _load_views(
 
     def load(image: ColmapImage) -> View | str:
         try:
-            return _load_view(image, splits[image.name], alignment, images_dir, root, config)
+            return _load_view(image, splits[image.name], alignment, images_dir, root, config, cache)
         except UnreadableImageError as error:
             return str(error)
 
+    cache = ImageCache(_cache_limit(config))
     pool = ThreadPoolExecutor(DECODERS)
     try:
         for count, (image, view) in enumerate(zip(chosen, pool.map(load, chosen), strict=True), start=1):
@@ -123,24 +133,45 @@ def _load_views(
     return views, broken
 
 
+def _cache_limit(config: DataConfig) -> int:
+    limit, available = parse_bytes(config.image_cache), available_memory()
+    return limit if available is None else min(limit, int(CACHE_SHARE * available))
+
+
 def _load_view(
-    image: ColmapImage, split: Split, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
+    image: ColmapImage,
+    split: Split,
+    alignment: Alignment,
+    images_dir: Path,
+    root: Path,
+    config: DataConfig,
+    cache: ImageCache,
 ) -> View:
     if image.camera.is_spherical():
         raise UserError(f"{image.name}: spherical cameras ({image.camera.model_name}) are not supported")
+    size = (image.camera.width, image.camera.height)
+    if size[0] * size[1] > config.max_image_pixels:
+        raise UnreadableImageError(
+            f"its camera has {size[0]}x{size[1]} pixels, more than --max-image-pixels {config.max_image_pixels}"
+        )
     grid = PixelGrid.from_colmap(image.camera, config.downscale)
     camera = alignment.apply_camera(Camera(image.viewmat, grid.K, grid.width, grid.height))
     files = PhotoFiles(root, images_dir, image.name, grid, config.max_image_pixels)
     pictures = files.load(use_mask=config.use_masks, use_depth=config.use_depth)
+    # A disparity map that is missing or broken now is not looked for, and warned of, again.
+    again = partial(files.load, use_mask=config.use_masks, use_depth=pictures.disparity is not None)
+    cached = CachedPictures(cache, image.name, files.photo, again)
+    cache.put(image.name, pictures, keep=split == "train")
     return View(
         name=image.name,
         camera=replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float()),
         split=split,
-        read_photo=pictures.read_photo,
-        read_mask=pictures.read_mask,
-        read_disparity=pictures.read_disparity,
+        read_photo=lambda: cached.get().read_photo(),
+        read_mask=lambda: cached.get().read_mask(),
+        read_disparity=lambda: cached.get().read_disparity(),
         read_clean=files.read_clean,
         read_truth_mask=files.read_truth_mask,
+        prefetch=cached.prefetch,
     )
 
 

@@ -166,6 +166,12 @@ class Pictures:
     mask: UInt8[Tensor, "H W"] | None
     disparity: UInt16[np.ndarray, "H W"] | None
 
+    @property
+    def num_bytes(self) -> int:
+        """Memory that they take."""
+        mask = 0 if self.mask is None else self.mask.numel()
+        return self.photo.numel() + mask + (0 if self.disparity is None else self.disparity.nbytes)
+
     def read_photo(self) -> UInt8[Tensor, "H W 3"]:
         """The photo's colours."""
         return self.photo

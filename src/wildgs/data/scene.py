@@ -94,6 +94,8 @@ class View:
     read_disparity: Callable[[], Float[Tensor, "H W"] | None] = field(repr=False, compare=False)
     read_clean: Callable[[], UInt8[Tensor, "H W 3"] | None] = field(repr=False, compare=False)
     read_truth_mask: Callable[[], UInt8[Tensor, "H W"] | None] = field(repr=False, compare=False)
+    prefetch: Callable[[], None] = field(default=lambda: None, repr=False, compare=False)
+    """Tells the readers that this photo's turn comes soon."""
 
 
 @dataclass(frozen=True)

@@ -162,6 +162,19 @@ class DensityControl:
         return rows
 
     @torch.no_grad()
+    def shrink(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, budget: int) -> int:
+        """Drops the least opaque Gaussians beyond a budget; how many it dropped."""
+        excess = len(gaussians) - budget
+        if excess <= 0:
+            return 0
+        keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+        keep[gaussians.opacities.argsort(stable=True)[:excess]] = False
+        edit_rows(gaussians, optimizer, keep, {name: rows[:0] for name, rows in gaussians.rows.items()})
+        gathered = {name: value.to(keep.device)[keep] for name, value in self.state().items()}
+        self.restore(gathered)
+        return excess
+
+    @torch.no_grad()
     def reset_opacity(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
         """Lowers all opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned."""
         ceiling = torch.tensor(self.config.reset_opacity).logit()

@@ -139,7 +139,7 @@ class Optimizers:
 def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
     """A moment in its parameter's memory layout: fused Adam walks both as they lie."""
     if value.shape != parameter.shape:
-        return value
+        return value.to(parameter.device)
     return torch.empty_like(parameter, requires_grad=False).copy_(value)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import warnings
 from pathlib import Path
 from types import TracebackType
 
@@ -11,24 +13,31 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from wildgs.engine.trainer import StepReport
+from wildgs.errors import WildGSWarning
 
 
 class Recorder:
     """An observer of training; a context manager that closes its files."""
 
-    def __init__(self, folder: Path, *, scalars_every: int = 50, pictures_every: int = 500) -> None:
+    def __init__(
+        self, folder: Path, *, scalars_every: int = 50, pictures_every: int = 500, step: int = 0
+    ) -> None:
         """Sets up a `Recorder`.
 
         Args:
             folder: The run folder.
             scalars_every: Steps between log entries.
             pictures_every: Steps between pictures on tensorboard.
+            step: Where the run stands; what an earlier, killed process recorded beyond it is dropped.
         """
         self.scalars_every = scalars_every
         self.pictures_every = pictures_every
         folder.mkdir(parents=True, exist_ok=True)
-        self._lines = (folder / "metrics.jsonl").open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(folder / "tensorboard"))
+        lines = folder / "metrics.jsonl"
+        _keep_until(lines, step)
+        self._lines = lines.open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+        self._failed = False
 
     def __enter__(self) -> Recorder:
         return self
@@ -39,15 +48,25 @@ class Recorder:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._lines.close()
-        self._board.close()
+        for file in (self._lines, self._board):
+            with contextlib.suppress(OSError):  # a full disk: what is lost was said already
+                file.close()
 
     def __call__(self, report: StepReport) -> None:
-        """Records a step, if it is one to be recorded."""
-        if report.step % self.scalars_every == 0:
-            self._record_scalars(report)
-        if report.step % self.pictures_every == 0:
-            self._record_pictures(report)
+        """Records a step, if it is one to be recorded; a disk that refuses ends the records, not the training."""
+        try:
+            if report.step % self.scalars_every == 0 or report.skipped is not None:
+                self._record_scalars(report)
+            if report.step % self.pictures_every == 0:
+                self._record_pictures(report)
+        except OSError as error:
+            if not self._failed:
+                warnings.warn(
+                    f"metrics.jsonl and tensorboard cannot be written ({error}); training goes on",
+                    WildGSWarning,
+                    stacklevel=2,
+                )
+            self._failed = True
 
     def _record_scalars(self, report: StepReport) -> None:
         values = report.losses.as_floats()
@@ -58,6 +77,8 @@ class Recorder:
         for name, value in values.items():
             self._board.add_scalar(f"train/{name}", value, report.step)
         line = {"step": report.step, "seconds": round(report.seconds, 3), "view": report.view.name, **values}
+        if report.skipped is not None:
+            line["skipped"] = report.skipped
         self._lines.write(json.dumps(line) + "\n")
         self._lines.flush()
 
@@ -81,3 +102,19 @@ def _grey(depth: Tensor) -> Tensor:
         disparity[disparity > 0].quantile(0.98) if bool((disparity > 0).any()) else disparity.new_tensor(1)
     )
     return (disparity / limit).clamp(0, 1)[..., None]
+
+
+def _keep_until(lines: Path, step: int) -> None:
+    """Drops records of steps that a resumed run will take again, and a line that was cut off."""
+    if not lines.is_file():
+        return
+    kept = []
+    for line in lines.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
+        except (ValueError, KeyError, TypeError):
+            continue
+    aside = lines.with_suffix(".partial")
+    aside.write_text("".join(kept), encoding="utf-8")
+    aside.replace(lines)

@@ -23,6 +23,10 @@ class ViewSampler:
         self.position += 1
         return int(self.order[self.position - 1])
 
+    def upcoming(self, count: int) -> list[int]:
+        """The next views' indices, as far as this round is drawn."""
+        return self.order[self.position : self.position + count].tolist()
+
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs."""
         return {"order": self.order.clone(), "position": torch.tensor(self.position)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,11 +11,13 @@ import torch
 from torch import Tensor
 
 from wildgs.data import Scene, View, scene_extent
+from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
+from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
 from wildgs.model.precision import Precision, choose_precision, lay_out_channels_last, set_precision
@@ -56,6 +59,7 @@ class StepReport:
         output: The forward pass.
         num_gaussians: N after the step.
         density: What densification did, where it ran.
+        skipped: Why the step was not taken, where its loss or gradient was no number.
         seconds: Training time so far, without what observers take.
     """
 
@@ -66,6 +70,7 @@ class StepReport:
     num_gaussians: int
     density: DensityReport | None
     seconds: float
+    skipped: str | None = None
 
 
 Observer = Callable[[StepReport], None]
@@ -101,9 +106,15 @@ class Trainer:
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
+        self.guard = StepGuard()
+        self._unreadable: set[str] = set()
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
-        """Trains until `config.steps`; every observer is called after every step."""
+        """Trains until `config.steps`; every observer is called after every step.
+
+        Raises:
+            TrainingDivergedError: Too many steps in a row had no finite loss or gradient.
+        """
         self.begin()
         try:
             while self.step < self.config.steps:
@@ -122,17 +133,44 @@ class Trainer:
     def advance(self) -> StepReport:
         """One step on one photo."""
         start = time.perf_counter()
-        view = self.views[self.sampler.next()]
+        view = self._next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
         losses.total.backward()
-        if self.schedule.gathers(self.step):
-            self.density.gather(output.projection)
-        self.optimizers.step()
+        fault = self.guard.judge(view.name, losses, self.method.parameters())
+        if fault is None:
+            if self.schedule.gathers(self.step):
+                self.density.gather(output.projection)
+            self.optimizers.step()
+        else:
+            self.method.zero_grad(set_to_none=True)
+            self.guard.report(self.step + 1, fault, self.method)
         self.step += 1
         density = self._control_density()
         self.seconds += time.perf_counter() - start
-        return StepReport(self.step, view, losses, output, len(self.method.gaussians), density, self.seconds)
+        count = len(self.method.gaussians)
+        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault)
+
+    def _next_view(self) -> View:
+        """The next photo that can be read; those after it are decoded in the background meanwhile.
+
+        Raises:
+            UserError: None can be read any more.
+        """
+        for _ in range(len(self.views)):
+            view = self.views[self.sampler.next()]
+            for index in self.sampler.upcoming(AHEAD):
+                self.views[index].prefetch()
+            try:
+                view.read_photo()
+                return view
+            except UserError as error:
+                if view.name not in self._unreadable:
+                    self._unreadable.add(view.name)
+                    warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+        raise UserError(
+            f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
+        )
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -166,6 +204,11 @@ class Trainer:
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         return report
 
+    def shrink_to_budget(self) -> int:
+        """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
+        budget = self.config.density.max_gaussians
+        return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+
     def _prepare(self) -> None:
         """Shows the method a few photos, spread over the collection."""
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
@@ -179,8 +222,12 @@ class Trainer:
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
         state |= {f"density.{name}": value for name, value in self.density.state().items()}
         state["random.generator"] = self.generator.get_state()
+        state["random.torch"] = torch.get_rng_state()
+        if self.device.type == "cuda":
+            state["random.cuda"] = torch.cuda.get_rng_state(self.device)
         state["progress.step"] = torch.tensor(self.step)
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
+        state["progress.skipped"] = torch.tensor(self.guard.skipped)
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -189,8 +236,13 @@ class Trainer:
         self.sampler.restore(_under(state, "sampler."))
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
+        if "random.torch" in state:  # files of the first version lack it
+            torch.set_rng_state(state["random.torch"])
+        if "random.cuda" in state and self.device.type == "cuda":
+            torch.cuda.set_rng_state(state["random.cuda"], self.device)
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
+        self.guard.skipped = int(state.get("progress.skipped", 0))
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -1,0 +1,64 @@
+"""Ctrl-C and the end of a cluster's time slot: the first finishes the step and saves, the second stops at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+from wildgs.engine.trainer import StepReport
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class InterruptedTrainingError(KeyboardInterrupt):
+    """Training stopped because it was asked to; everything is saved.
+
+    Attributes:
+        code: The process's exit code by the shell's convention, 128 + signal.
+    """
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.code = 128 + number
+
+
+class StopOnSignal:
+    """An observer of training that ends it between two steps once a signal has come."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopOnSignal:
+        if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
+            for number in _SIGNALS:
+                self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+        # Not print(): the signal may have come in the middle of one.
+        os.write(2, b"\nstopping after this step, then saving; once more stops at once, unsaved\n")
+
+    def __call__(self, report: StepReport) -> None:
+        """Ends training if a signal has come.
+
+        Raises:
+            InterruptedTrainingError: It has.
+        """
+        if self.received is not None:
+            raise InterruptedTrainingError(f"interrupted at step {report.step}", self.received)

@@ -1,0 +1,99 @@
+"""Steps whose loss or gradient is no number: not taken, counted, and the run's end when they do not stop."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.losses.objective import Losses
+
+PATIENCE = 10
+"""Bad steps in a row that end a run."""
+
+
+class TrainingDivergedError(UserError):
+    """The loss or its gradient was no finite number for `PATIENCE` steps in a row."""
+
+
+class StepGuard:
+    """Judges every step before the optimisers take it.
+
+    Attributes:
+        skipped: Steps not taken so far.
+        in_a_row: Steps not taken since the last good one.
+    """
+
+    def __init__(self) -> None:
+        self.skipped = 0
+        self.in_a_row = 0
+        self._photos: list[str] = []
+
+    def judge(self, photo: str, losses: Losses, parameters: Iterable[Tensor]) -> str | None:
+        """Whether a step may be taken; call after the backward pass.
+
+        Args:
+            photo: Name of the photo that trains.
+            losses: Of this step.
+            parameters: With their gradients.
+
+        Returns:
+            None for a good step, else what is not finite.
+        """
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        norm = nn.utils.get_total_norm(gradients) if gradients else losses.total.new_zeros(())
+        # One number, so that a GPU is waited for once.
+        if bool(torch.isfinite(losses.total.detach() + norm.to(losses.total))):
+            self.in_a_row = 0
+            self._photos.clear()
+            return None
+        self.skipped += 1
+        self.in_a_row += 1
+        self._photos.append(photo)
+        terms = [name for name, value in losses.as_floats().items() if not _finite(value)]
+        return f"loss term {terms[0]}" if terms else "gradient"
+
+    def report(self, step: int, fault: str, method: nn.Module) -> None:
+        """Says that a step was not taken.
+
+        Args:
+            step: Its number.
+            fault: From `judge`.
+            method: Searched for parameters that are no numbers, where the run has to end.
+
+        Raises:
+            TrainingDivergedError: It was one too many in a row.
+        """
+        photo = self._photos[-1]
+        if self.in_a_row >= PATIENCE:
+            raise TrainingDivergedError(_diagnosis(step, fault, self._photos, method))
+        if self.in_a_row == 1 or self.skipped <= PATIENCE:
+            warnings.warn(
+                f"step {step}, photo {photo}: the {fault} is no finite number; the step is skipped "
+                f"({self.skipped} so far)",
+                WildGSWarning,
+                stacklevel=2,
+            )
+
+
+def _diagnosis(step: int, fault: str, photos: list[str], method: nn.Module) -> str:
+    broken = [name for name, value in method.named_parameters() if not bool(torch.isfinite(value).all())]
+    names = sorted(set(photos))
+    if broken:
+        cause = f"the parameters {', '.join(broken[:3])} hold values that are no numbers"
+    elif len(names) == 1:
+        cause = f"all of them on the photo {names[0]}; look at it and its camera, or take it out of the scene"
+    else:
+        cause = f"on {len(names)} photos ({', '.join(names[:3])}, ...), with parameters that are sound"
+    return (
+        f"training diverged at step {step}: {PATIENCE} steps in a row had no finite {fault}: {cause}. "
+        "The newest checkpoint is from before; --resume goes on from it, and lower learning rates "
+        "(--optimizer.*) in a new run may help"
+    )
+
+
+def _finite(value: float) -> bool:
+    return value - value == 0
