@@ -164,7 +164,10 @@ class CachedPictures:
 
 
 def available_memory() -> int | None:
-    """Bytes that a process can still take without swapping; None where the system does not say."""
+    """Bytes that a process can still take without swapping; None where the system does not say.
+
+    Processes that torchrun started on this machine get equal shares.
+    """
     found = []
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
@@ -184,4 +187,4 @@ def available_memory() -> int | None:
             found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
         except (AttributeError, ValueError, OSError):
             return None
-    return max(0, min(found))
+    return max(0, min(found)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))

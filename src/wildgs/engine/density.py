@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.engine.optimizers import edit_rows, reset_moments
@@ -40,6 +40,21 @@ class DensityConfig:
     prune_reach: float = 0.15
     reset_opacity: float = 0.01
     max_gaussians: int = 3_000_000
+
+
+@dataclass(frozen=True)
+class ScreenStatistics:
+    """What views say about each Gaussian; N rows.
+
+    Attributes:
+        gradient_sum: Norms of the screen gradient, per half picture, added up over the views that see it.
+        seen: How many views do.
+        reach: Its largest radius, as a share of a picture's longer side.
+    """
+
+    gradient_sum: Float[Tensor, "N"]
+    seen: Float[Tensor, "N"]
+    reach: Float[Tensor, "N"]
 
 
 @dataclass(frozen=True)
@@ -79,19 +94,34 @@ class DensityControl:
         """Goes on where `state` was taken."""
         self.gradient_sum, self.seen, self.reach = (state[k] for k in ("gradient_sum", "seen", "reach"))
 
-    @torch.no_grad()
     def gather(self, projection: Projection) -> None:
         """Adds one view's screen gradients and reaches; call after the backward pass."""
+        self.add(self.measure(projection))
+
+    @staticmethod
+    @torch.no_grad()
+    def measure(projection: Projection) -> ScreenStatistics:
+        """One view's screen gradients and reaches; zeros where no gradient reached the screen."""
         gradient = projection.means2d.grad
         if gradient is None:
-            return
-        half = torch.tensor([projection.camera.width / 2, projection.camera.height / 2]).to(gradient)
-        visible = projection.visible
+            zeros = torch.zeros_like(projection.means2d[:, 0])
+            return ScreenStatistics(zeros, zeros, zeros)
+        camera = projection.camera
+        half = torch.tensor([camera.width / 2, camera.height / 2]).to(gradient)
         norm = (gradient * half).norm(dim=-1)
-        self.gradient_sum = self.gradient_sum.to(norm.device) + torch.where(visible, norm, 0.0)
-        self.seen = self.seen.to(norm.device) + visible
-        share = projection.radii / max(projection.camera.width, projection.camera.height)
-        self.reach = torch.maximum(self.reach.to(norm.device), share)
+        return ScreenStatistics(
+            gradient_sum=torch.where(projection.visible, norm, 0.0),
+            seen=projection.visible.to(norm),
+            reach=(projection.radii / max(camera.width, camera.height)).to(norm),
+        )
+
+    @torch.no_grad()
+    def add(self, statistics: ScreenStatistics) -> None:
+        """Adds what one view or several say."""
+        device = statistics.seen.device
+        self.gradient_sum = self.gradient_sum.to(device) + statistics.gradient_sum
+        self.seen = self.seen.to(device) + statistics.seen
+        self.reach = torch.maximum(self.reach.to(device), statistics.reach)
 
     @torch.no_grad()
     def densify(

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from wildgs import __version__
 from wildgs.data import Scene, View, scene_extent
 from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
+from wildgs.engine.distributed import VERIFY_EVERY, Team
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
-from wildgs.engine.schedule import Schedule, ScheduleConfig
+from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
@@ -30,7 +33,7 @@ class TrainConfig:
     """Training.
 
     Attributes:
-        steps: How long (paper: 30,000; '†': 15,000).
+        steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
         seed: Of everything random.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
         objective: Loss weights.
@@ -60,6 +63,7 @@ class StepReport:
         num_gaussians: N after the step.
         density: What densification did, where it ran.
         skipped: Why the step was not taken, where its loss or gradient was no number.
+        taken: Steps that this one counts for: photos of all processes.
         seconds: Training time so far, without what observers take.
     """
 
@@ -71,6 +75,11 @@ class StepReport:
     density: DensityReport | None
     seconds: float
     skipped: str | None = None
+    taken: int = 1
+
+    def falls_on(self, every: int) -> bool:
+        """Whether this step is, or passed, a multiple of `every`."""
+        return falls_on(self.step, self.taken, every)
 
 
 Observer = Callable[[StepReport], None]
@@ -79,20 +88,29 @@ Observer = Callable[[StepReport], None]
 class Trainer:
     """Trains a method on a scene's training photos."""
 
-    def __init__(self, method: Method, scene: Scene, config: TrainConfig) -> None:
+    def __init__(
+        self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None
+    ) -> None:
         """Sets up a `Trainer`.
 
         Args:
             method: Trained in place, on the device on which its parameters are.
             scene: The photos; nothing of it under `truth/` is read.
             config: How.
+            team: The processes that train this model together; by default this one alone.
 
         Raises:
-            UserError: There is no photo to train on.
+            UserError: There is no photo to train on, or there are fewer than processes.
         """
         self.views = scene.train_views
+        self.team = team or Team()
         if not self.views:
             raise UserError(f"{scene.root}: no photo to train on; the split leaves none that has a camera")
+        if len(self.views) < self.team.size:
+            raise UserError(
+                f"{scene.root}: {len(self.views)} photos to train on are too few for {self.team.size} processes; "
+                f"use at most {len(self.views)}"
+            )
         self.method = method
         self.config = config
         self.device = method.gaussians.means.device
@@ -102,12 +120,13 @@ class Trainer:
         self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
-        self.optimizers = Optimizers.build(method, config.optimizer, extent)
+        self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.guard = StepGuard()
         self._unreadable: set[str] = set()
+        self._photos = ""
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -125,31 +144,46 @@ class Trainer:
             set_precision(self.method, torch.float32)
 
     def begin(self) -> None:
-        """Gets the method ready for `advance`; `run` does it by itself."""
+        """Gets the method ready for `advance`, the same on all ranks; `run` does it by itself.
+
+        Raises:
+            UserError: The ranks cannot train one model: their photos, models or versions differ.
+        """
+        precision = choose_precision(self.config.precision, self.device)
+        self.team.require_same(self._facts(precision))
         if self.step == 0:
-            self._prepare()
-        set_precision(self.method, choose_precision(self.config.precision, self.device))
+            with self.team.together():
+                self._prepare()
+        self.team.share(self.method.state_dict().values())
+        self._verify()
+        set_precision(self.method, precision)
 
     def advance(self) -> StepReport:
-        """One step on one photo."""
+        """One step: a photo on every rank."""
         start = time.perf_counter()
         view = self._next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
         losses.total.backward()
-        fault = self.guard.judge(view.name, losses, self.method.parameters())
+        losses = self.team.average(self.method.parameters(), losses)
+        fault = self.guard.judge(self._photos, losses, self.method.parameters())
         if fault is None:
             if self.schedule.gathers(self.step):
-                self.density.gather(output.projection)
+                self._gather(output)
             self.optimizers.step()
         else:
             self.method.zero_grad(set_to_none=True)
-            self.guard.report(self.step + 1, fault, self.method)
-        self.step += 1
-        density = self._control_density()
+            with self.team.together():
+                self.guard.report(self.step + 1, fault, self.method)
+        before = self.step
+        self.step = min(before + self.team.size, self.config.steps)
+        taken = self.step - before
+        density = self._control_density(taken)
+        if falls_on(self.step, taken, VERIFY_EVERY) or self.step == self.config.steps:
+            self._verify()
         self.seconds += time.perf_counter() - start
         count = len(self.method.gaussians)
-        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault)
+        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault, taken)
 
     def _next_view(self) -> View:
         """The next photo that can be read; those after it are decoded in the background meanwhile.
@@ -157,10 +191,8 @@ class Trainer:
         Raises:
             UserError: None can be read any more.
         """
-        for _ in range(len(self.views)):
-            view = self.views[self.sampler.next()]
-            for index in self.sampler.upcoming(AHEAD):
-                self.views[index].prefetch()
+        for index in self._candidates():
+            view = self.views[index]
             try:
                 view.read_photo()
                 return view
@@ -171,6 +203,20 @@ class Trainer:
         raise UserError(
             f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
         )
+
+    def _candidates(self) -> Iterator[int]:
+        """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
+        size, rank = self.team.size, self.team.rank
+        for _ in range(len(self.views) if size == 1 else 1):
+            batch = self.sampler.take(size)
+            self._photos = ", ".join(self.views[index].name for index in batch)
+            for index in self.sampler.upcoming(AHEAD * size)[rank::size]:
+                self.views[index].prefetch()
+            yield batch[rank]
+        if size > 1:
+            start = batch[rank]
+            others = [(start + offset) % len(self.views) for offset in range(len(self.views))]
+            yield from (index for index in others if index not in batch)
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -193,14 +239,18 @@ class Trainer:
         )
         return output, losses
 
-    def _control_density(self) -> DensityReport | None:
+    def _gather(self, output: TrainingOutput) -> None:
+        """Pools all ranks' screen statistics at once: then any rank's state is the whole of it."""
+        self.density.add(self.team.pool(self.density.measure(output.projection)))
+
+    def _control_density(self, taken: int) -> DensityReport | None:
         report = None
-        if self.schedule.densifies(self.step):
+        if self.schedule.densifies(self.step, taken):
             large = self.step > self.schedule.reset_every
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )
-        if self.schedule.resets(self.step):
+        if self.schedule.resets(self.step, taken):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         return report
 
@@ -208,6 +258,24 @@ class Trainer:
         """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
         budget = self.config.density.max_gaussians
         return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+
+    def _facts(self, precision: torch.dtype) -> dict[str, str]:
+        """What has to be the same on all ranks before they begin."""
+        shapes = {name: tuple(value.shape) for name, value in self.method.state_dict().items()}
+        return {
+            "version of wildgs": __version__,
+            "version of torch": torch.__version__,
+            "kind of device": self.device.type,
+            "precision": str(precision),
+            "photos to train on": f"{len(self.views)} (checksum {_checksum(self.views)})",
+            "number of Gaussians": f"{len(self.method.gaussians):,}",
+            "model": f"{type(self.method).__name__} (checksum {_checksum(shapes)})",
+            "settings": f"{self.config.steps} steps (checksum {_checksum(self.config)})",
+        }
+
+    def _verify(self) -> None:
+        if self.team.size > 1:
+            self.team.verify(self.step, {n: v for n, v in self.state().items() if n != "progress.seconds"})
 
     def _prepare(self) -> None:
         """Shows the method a few photos, spread over the collection."""
@@ -243,6 +311,10 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
+
+
+def _checksum(value: object) -> str:
+    return f"{zlib.crc32(repr(value).encode()):08x}"
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
