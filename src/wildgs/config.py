@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import reprlib
 import types
 import typing
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
+
+MAX_CONFIG_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,11 @@ def to_plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+def _shortened(value: Any) -> str:
+    """A value for a message; YAML's references can stand for more text than memory holds."""
+    return reprlib.repr(value)
+
+
 def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
     """The inverse of `to_plain`; missing entries take their defaults.
 
@@ -73,19 +81,26 @@ def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
         return Path(value)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if isinstance(kind, type) and type(value) is kind:
+    if isinstance(kind, type) and type(value) is kind and value == value:  # NaN is nothing
         return value
-    raise UserError(f"{where}: {value!r} is not a {getattr(kind, '__name__', kind)}")
+    raise UserError(f"{where}: {_shortened(value)} is not a {getattr(kind, '__name__', kind)}")
 
 
 def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise UserError(f"{where}: expected a mapping, found {value!r}")
+        raise UserError(f"{where}: expected a mapping, found {_shortened(value)}")
     hints = typing.get_type_hints(kind)
     known = {f.name for f in dataclasses.fields(kind)}
-    if unknown := sorted(set(value) - known):
-        raise UserError(f"{where}: unknown entry {unknown[0]!r}; known are {', '.join(sorted(known))}")
+    if unknown := sorted(map(str, set(value) - known)):
+        raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; known are {', '.join(sorted(known))}")
+    required = {f.name for f in dataclasses.fields(kind) if _is_required(f)}
+    if lacking := sorted(required - set(value)):
+        raise UserError(f"{where}: the entry {lacking[0]!r} is missing")
     return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
+
+
+def _is_required(entry: dataclasses.Field[Any]) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
 
 
 def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
@@ -96,7 +111,17 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return from_plain(kind, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {value!r} fits none of {kinds}")
+    raise UserError(f"{where}: {_shortened(value)} fits none of {kinds}")
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain data without references, by which a small file can stand for more than memory holds."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(None, None, "references are not allowed", event.start_mark)
+        return super().compose_node(parent, index)
 
 
 def write_config(path: Path, config: RunConfig) -> None:
@@ -125,7 +150,9 @@ def read_config(path: Path) -> RunConfig:
         UserError: The file is missing, no YAML, or no run configuration.
     """
     try:
-        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise UserError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is no run's configuration")
+        plain = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # a date that is none: ValueError
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
     return from_plain(RunConfig, plain, str(path))

@@ -177,10 +177,8 @@ def test_records_that_cannot_be_written_do_not_end_training(
         raise OSError(28, "No space left on device")
 
     with Recorder(tmp_path, scalars_every=1, pictures_every=100) as recorder:
-        lines = recorder._lines
-        monkeypatch.setattr(
-            recorder, "_lines", type("Full", (), {"write": staticmethod(full), "close": lines.close})()
-        )
+        recorder._lines.close()
+        monkeypatch.setattr(recorder, "_lines", SimpleNamespace(write=full, close=lambda: None))
         with pytest.warns(WildGSWarning, match=r"metrics\.jsonl.*training goes on") as caught:
             trainer.run([recorder])
     assert trainer.step == 6

@@ -147,7 +147,7 @@ def _load(source: str, *, local: bool) -> Any:
         logging.disable_progress_bar()
     try:
         loaded: Any = DepthAnythingForDepthEstimation.from_pretrained(
-            source, local_files_only=local, output_loading_info=True
+            source, local_files_only=local, use_safetensors=True, output_loading_info=True
         )
     finally:
         logging.set_verbosity(verbosity)

@@ -179,6 +179,7 @@ def read_disparity(
         _check_shape(image, size)
         _load(image)
         values = np.asarray(image if _is_deep(image) else image.convert("L")).astype(np.float32)
+        values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
         if not _is_deep(image):
             values *= 257.0
     if (values.shape[1], values.shape[0]) != size:
@@ -219,6 +220,7 @@ def _to_rgb(image: Image.Image) -> tuple[Image.Image, UInt8[np.ndarray, "H W"] |
 def _to_8_bits(values: Shaped[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
     """Grey of more than 8 bits: 16-bit integers, or floats in [0, 1]."""
     full = 1.0 if values.dtype.kind == "f" else 65535.0
+    values = np.nan_to_num(values, nan=0.0)
     return np.clip(np.round(values.astype(np.float64) * (255.0 / full)), 0, 255).astype(np.uint8)
 
 

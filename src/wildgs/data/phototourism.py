@@ -12,6 +12,8 @@ from wildgs.data.colmap import describe_names
 from wildgs.data.scene import Split
 from wildgs.errors import UserError, WildGSWarning
 
+MAX_FILE_BYTES = 100 * 10**6
+
 logger = logging.getLogger(__name__)
 
 
@@ -40,6 +42,8 @@ def read_split(path: Path) -> dict[str, Split]:
         UserError: The file is not such a table.
     """
     try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise UserError(f"{path}: larger than {MAX_FILE_BYTES} bytes; this is no split file")
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(csv.DictReader(file, delimiter="\t"))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -55,12 +59,11 @@ def read_split(path: Path) -> dict[str, Split]:
         filename, split = (row["filename"] or "").strip(), (row["split"] or "").strip().lower()
         if not filename or not (row.get("id", "0") or "").strip():
             continue
-        if split == "train":
-            splits[filename] = "train"
-        elif split == "test":
-            splits[filename] = "test"
-        else:
+        if split not in ("train", "test"):
             raise UserError(f"{path}: {filename} has the split {split!r}; it must be train or test")
+        if splits.get(filename, split) != split:
+            raise UserError(f"{path}: {filename} is listed as train and as test; keep one of the rows")
+        splits[filename] = "train" if split == "train" else "test"
     return splits
 
 

@@ -134,7 +134,7 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
 
     if Path(source).is_dir():
         try:
-            resnet = ResNetModel.from_pretrained(source, local_files_only=True)
+            resnet = ResNetModel.from_pretrained(source, local_files_only=True, use_safetensors=True)
         except (OSError, ValueError, RuntimeError) as error:
             raise UserError(f"{source} does not hold a ResNet-18 in the hub's layout: {error}") from error
         if tuple(resnet.config.hidden_sizes or ()) != FEATURE_WIDTHS[1:]:
@@ -144,7 +144,7 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
         if not local and not hub_reachable():
             return None
         try:
-            return ResNetModel.from_pretrained(source, local_files_only=local)
+            return ResNetModel.from_pretrained(source, local_files_only=local, use_safetensors=True)
         except Exception:  # the hub's client raises many kinds of errors; all of them mean 'not to be had'
             continue
     return None
