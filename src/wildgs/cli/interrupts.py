@@ -8,7 +8,7 @@ import threading
 from types import FrameType, TracebackType
 from typing import Any
 
-from wildgs.engine.distributed import Team
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import StepReport
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

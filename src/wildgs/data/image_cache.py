@@ -18,6 +18,7 @@ from pathlib import Path
 from wildgs.data.images import UnreadableImageError
 from wildgs.data.pictures import Pictures
 from wildgs.errors import UserError
+from wildgs.launch import local_world_size
 
 DECODERS = 4
 """Threads that decode photos; Pillow works without Python's lock."""
@@ -187,4 +188,4 @@ def available_memory() -> int | None:
             found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
         except (AttributeError, ValueError, OSError):
             return None
-    return max(0, min(found)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return max(0, min(found)) // local_world_size()

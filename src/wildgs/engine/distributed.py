@@ -1,8 +1,7 @@
 """Training on several processes (ranks): `torchrun --nproc-per-node K -m wildgs train ...`.
 
 Every rank holds the whole model and takes another photo; gradients and screen statistics are pooled, and all that
-decides is the same everywhere, so the ranks stay identical to the bit. docs/scaling.md has the arithmetic. The trainer
-talks to a `Team`: the class itself is one process alone, which exchanges nothing; `Ranks` is one of several.
+decides is the same everywhere, so the ranks stay identical to the bit. docs/scaling.md has the arithmetic.
 """
 
 from __future__ import annotations
@@ -19,8 +18,10 @@ import torch
 from torch import Tensor
 from torch import distributed as dist
 
+from wildgs import launch
 from wildgs.engine.collectives import fingerprints, sum_over_ranks
 from wildgs.engine.density import ScreenStatistics
+from wildgs.engine.team import DivergedRanksError, LostRankError, Team
 from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.losses.objective import Losses
 from wildgs.rasterize.cpu.threads import thread_count
@@ -30,109 +31,6 @@ Result = TypeVar("Result")
 TIMEOUT = timedelta(minutes=10)
 """How long a rank waits for another one that is silent but whose connection stands: the first use of the CPU's
 kernels compiles for minutes, and a checkpoint on a slow disk takes its time."""
-
-VERIFY_EVERY = 500
-"""Photos between checks that all ranks hold the same bits."""
-
-
-class LostRankError(UserError):
-    """Another process of this training ended, or does not answer."""
-
-
-class DivergedRanksError(UserError):
-    """The ranks do not hold the same model any more."""
-
-
-class Team:
-    """The processes that train one model, as one of them sees it. This class: one process alone.
-
-    Attributes:
-        rank: This process, from 0.
-        size: How many there are.
-        wish: The signal by which this process was asked to stop, 0 for none; carried to all with the next step.
-    """
-
-    rank: int = 0
-    size: int = 1
-
-    def __init__(self) -> None:
-        self.wish = 0
-
-    @property
-    def first(self) -> bool:
-        """Whether this process writes files and talks to the user."""
-        return self.rank == 0
-
-    @property
-    def verdict(self) -> int:
-        """The signal by which all are to stop after this step, 0 for none; the same on all ranks."""
-        return self.wish
-
-    @contextmanager
-    def together(self) -> Iterator[None]:
-        """A block that all ranks run alike: warnings come from rank 0, and one rank's mistake ends all.
-
-        Inside it there may be no exchange between ranks.
-
-        Raises:
-            UserError: On rank 0: what went wrong, on which rank.
-            ReportedError: On the other ranks.
-        """
-        yield
-
-    def from_first(self, function: Callable[[], Result]) -> Result:
-        """What a function returns on rank 0, where alone it is called.
-
-        Raises:
-            UserError: The function did, on rank 0.
-            ReportedError: On the other ranks then.
-        """
-        return function()
-
-    def least(self, value: int) -> int:
-        """The smallest of all ranks' values."""
-        return value
-
-    def require_same(self, facts: Mapping[str, str]) -> None:
-        """Compares facts that have to be the same on all ranks.
-
-        Raises:
-            UserError: Some are not.
-        """
-
-    def share(self, tensors: Iterable[Tensor]) -> None:
-        """Gives rank 0's values to all ranks, in place."""
-
-    def average(self, parameters: Iterable[Tensor], losses: Losses) -> Losses:
-        """Replaces gradients by their means over the ranks; returns the mean losses, detached.
-
-        A parameter without a gradient on some ranks counts as zero there; without one on all, it keeps none.
-
-        Raises:
-            LostRankError: A rank is gone.
-            DivergedRanksError: The ranks' models differ in size.
-        """
-        return losses
-
-    def pool(self, statistics: ScreenStatistics) -> ScreenStatistics:
-        """All ranks' screen statistics as one: sums and maxima.
-
-        Raises:
-            LostRankError: A rank is gone.
-        """
-        return statistics
-
-    def verify(self, step: int, state: Mapping[str, Tensor]) -> None:
-        """Compares fingerprints of tensors that should be the same everywhere.
-
-        Args:
-            step: Named in the message.
-            state: Any tensors by name.
-
-        Raises:
-            DivergedRanksError: They differ.
-            LostRankError: A rank is gone.
-        """
 
 
 class Ranks(Team):
@@ -243,7 +141,9 @@ class Ranks(Team):
     def verify(self, step: int, state: Mapping[str, Tensor]) -> None:  # noqa: D102 - as in Team
         gathered = self._gather(fingerprints(state))
         for rank, found in enumerate(gathered):
-            unlike = [name for name in gathered[0].keys() | found.keys() if gathered[0].get(name) != found.get(name)]
+            unlike = [
+                name for name in gathered[0].keys() | found.keys() if gathered[0].get(name) != found.get(name)
+            ]
             if unlike:
                 message = (
                     f"rank {rank} and rank 0 do not hold the same model after step {step}: {len(unlike)} of "
@@ -287,11 +187,6 @@ def _notices_first() -> bool:
         return True
 
 
-def launched_ranks() -> int:
-    """How many processes torchrun started (1 without it)."""
-    return int(os.environ.get("WORLD_SIZE", "1")) if "RANK" in os.environ else 1
-
-
 @contextmanager
 def join() -> Iterator[Team]:
     """Joins the processes that torchrun started; without it, a team of one.
@@ -299,10 +194,10 @@ def join() -> Iterator[Team]:
     Raises:
         UserError: There are more processes than GPUs, or no connection.
     """
-    if launched_ranks() == 1:
+    if launch.world_size() == 1:
         yield Team()
         return
-    local = int(os.environ.get("LOCAL_RANK", "0"))
+    local = launch.local_rank()
     _share_cores()
     try:
         if torch.cuda.is_available():
@@ -326,7 +221,7 @@ def _take_gpu(local: int) -> None:
     count = torch.cuda.device_count()
     if local >= count:
         raise UserError(
-            f"this machine has {count} GPUs for {os.environ.get('LOCAL_WORLD_SIZE')} processes; "
+            f"this machine has {count} GPUs for {launch.local_world_size()} processes; "
             f"use --nproc-per-node {count}"
         )
     torch.cuda.set_device(local)
@@ -337,5 +232,5 @@ def _share_cores() -> None:
     if os.environ.get("OMP_NUM_THREADS", "1") != "1":
         return  # the user's choice
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    share = max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+    share = max(1, cores // launch.local_world_size())
     torch.set_num_threads(thread_count() if "WILDGS_NUM_THREADS" in os.environ else share)

@@ -70,9 +70,7 @@ class Optimizers:
     photos: int = 1
 
     @classmethod
-    def build(
-        cls, method: Method, config: OptimizerConfig, extent: float, photos: int = 1
-    ) -> Optimizers:
+    def build(cls, method: Method, config: OptimizerConfig, extent: float, photos: int = 1) -> Optimizers:
         """Optimisers for a method.
 
         Args:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import time
 import warnings
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from wildgs import __version__
 from wildgs.data import Scene, View, scene_extent
 from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
-from wildgs.engine.distributed import VERIFY_EVERY, Team
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
+from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
@@ -88,9 +86,7 @@ Observer = Callable[[StepReport], None]
 class Trainer:
     """Trains a method on a scene's training photos."""
 
-    def __init__(
-        self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None
-    ) -> None:
+    def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
         """Sets up a `Trainer`.
 
         Args:
@@ -150,7 +146,7 @@ class Trainer:
             UserError: The ranks cannot train one model: their photos, models or versions differ.
         """
         precision = choose_precision(self.config.precision, self.device)
-        self.team.require_same(self._facts(precision))
+        self.team.require_same(same_everywhere(self.method, self.views, self.config, precision))
         if self.step == 0:
             with self.team.together():
                 self._prepare()
@@ -259,20 +255,6 @@ class Trainer:
         budget = self.config.density.max_gaussians
         return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
 
-    def _facts(self, precision: torch.dtype) -> dict[str, str]:
-        """What has to be the same on all ranks before they begin."""
-        shapes = {name: tuple(value.shape) for name, value in self.method.state_dict().items()}
-        return {
-            "version of wildgs": __version__,
-            "version of torch": torch.__version__,
-            "kind of device": self.device.type,
-            "precision": str(precision),
-            "photos to train on": f"{len(self.views)} (checksum {_checksum(self.views)})",
-            "number of Gaussians": f"{len(self.method.gaussians):,}",
-            "model": f"{type(self.method).__name__} (checksum {_checksum(shapes)})",
-            "settings": f"{self.config.steps} steps (checksum {_checksum(self.config)})",
-        }
-
     def _verify(self) -> None:
         if self.team.size > 1:
             self.team.verify(self.step, {n: v for n, v in self.state().items() if n != "progress.seconds"})
@@ -311,10 +293,6 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
-
-
-def _checksum(value: object) -> str:
-    return f"{zlib.crc32(repr(value).encode()):08x}"
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
