@@ -34,6 +34,7 @@ from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig, DensityControl
 from wildgs.engine.optimizers import Optimizers
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.registry import MethodName, create_method
@@ -162,13 +163,20 @@ def _tensors(value: Any) -> Iterator[Tensor]:
             yield from _tensors(part)
 
 
-def make_scene(folder: Path, long_side: int) -> Scene:
+def make_scene(folder: Path, long_side: int, photos: int = PHOTOS) -> Scene:
     """The demo's landmark."""
-    make_landmark(folder, SyntheticConfig(photos=PHOTOS, long_side=long_side))
+    make_landmark(folder, SyntheticConfig(photos=photos, long_side=long_side))
     return load_scene(folder, DataConfig(holdout=0))
 
 
-def make_trainer(name: MethodName, scene: Scene, n: int, device: torch.device, model: WildGSConfig) -> Trainer:
+def make_trainer(
+    name: MethodName,
+    scene: Scene,
+    n: int,
+    device: torch.device,
+    model: WildGSConfig,
+    team: Team | None = None,
+) -> Trainer:
     """A trainer at the start of the second stage, with N Gaussians."""
     generator = torch.Generator().manual_seed(0)
     source = torch.randint(len(scene.points), (n,), generator=generator)
@@ -176,7 +184,7 @@ def make_trainer(name: MethodName, scene: Scene, n: int, device: torch.device, m
     torch.manual_seed(0)
     method = create_method(name, model, scene.points[source] + noise, scene.point_colors[source])
     config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
-    trainer = Trainer(method.to(device), scene, config)
+    trainer = Trainer(method.to(device), scene, config, team)
     trainer.begin()
     trainer.step = trainer.schedule.first_stage + 1
     return trainer
