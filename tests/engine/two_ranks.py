@@ -55,7 +55,7 @@ def first_gradients(output: Path, team: Team) -> None:
         rendered, losses = together._forward(together._next_view())
         losses.total.backward()
         mean = team.average(together.method.parameters(), losses)
-        together._gather(rendered)
+        together.density.gather(rendered.projection, team.pool)
 
         alone = trainer_for(method, Team(), ScheduleConfig(first_stage=0))
         alone.begin()
@@ -64,7 +64,7 @@ def first_gradients(output: Path, team: Team) -> None:
             rendered, losses = alone._forward(alone.views[index])
             (losses.total / 2).backward()
             rendered.projection.means2d.grad *= 2
-            alone._gather(rendered)
+            alone.density.gather(rendered.projection)
             both.append(losses)
         found = {"together": found_in(together, [mean]), "alone": found_in(alone, both)}
         torch.save(found, output / f"gradients_{method}_{team.rank}.pt")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -94,9 +95,24 @@ class DensityControl:
         """Goes on where `state` was taken."""
         self.gradient_sum, self.seen, self.reach = (state[k] for k in ("gradient_sum", "seen", "reach"))
 
-    def gather(self, projection: Projection) -> None:
-        """Adds one view's screen gradients and reaches; call after the backward pass."""
-        self.add(self.measure(projection))
+    @torch.no_grad()
+    def gather(
+        self, projection: Projection, pool: Callable[[ScreenStatistics], ScreenStatistics] | None = None
+    ) -> None:
+        """Adds one view's screen gradients and reaches; call after the backward pass.
+
+        Args:
+            projection: Of that view.
+            pool: Makes one view's statistics those of several processes' views, at once: then what this holds
+                is the whole of it in any of them.
+        """
+        statistics = self.measure(projection)
+        if pool is not None:
+            statistics = pool(statistics)
+        device = statistics.seen.device
+        self.gradient_sum = self.gradient_sum.to(device) + statistics.gradient_sum
+        self.seen = self.seen.to(device) + statistics.seen
+        self.reach = torch.maximum(self.reach.to(device), statistics.reach)
 
     @staticmethod
     @torch.no_grad()
@@ -114,14 +130,6 @@ class DensityControl:
             seen=projection.visible.to(norm),
             reach=(projection.radii / max(camera.width, camera.height)).to(norm),
         )
-
-    @torch.no_grad()
-    def add(self, statistics: ScreenStatistics) -> None:
-        """Adds what one view or several say."""
-        device = statistics.seen.device
-        self.gradient_sum = self.gradient_sum.to(device) + statistics.gradient_sum
-        self.seen = self.seen.to(device) + statistics.seen
-        self.reach = torch.maximum(self.reach.to(device), statistics.reach)
 
     @torch.no_grad()
     def densify(

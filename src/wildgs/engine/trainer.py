@@ -165,7 +165,7 @@ class Trainer:
         fault = self.guard.judge(self._photos, losses, self.method.parameters())
         if fault is None:
             if self.schedule.gathers(self.step):
-                self._gather(output)
+                self.density.gather(output.projection, self.team.pool)
             self.optimizers.step()
         else:
             self.method.zero_grad(set_to_none=True)
@@ -203,16 +203,16 @@ class Trainer:
     def _candidates(self) -> Iterator[int]:
         """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
         size, rank = self.team.size, self.team.rank
-        for _ in range(len(self.views) if size == 1 else 1):
+        for _ in range(len(self.views)):
             batch = self.sampler.take(size)
             self._photos = ", ".join(self.views[index].name for index in batch)
             for index in self.sampler.upcoming(AHEAD * size)[rank::size]:
                 self.views[index].prefetch()
             yield batch[rank]
-        if size > 1:
-            start = batch[rank]
-            others = [(start + offset) % len(self.views) for offset in range(len(self.views))]
-            yield from (index for index in others if index not in batch)
+            if size > 1:
+                following = range(batch[rank] + 1, batch[rank] + len(self.views))
+                yield from (i % len(self.views) for i in following if i % len(self.views) not in batch)
+                return
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -234,10 +234,6 @@ class Trainer:
             train_mask=stage.learn_mask,
         )
         return output, losses
-
-    def _gather(self, output: TrainingOutput) -> None:
-        """Pools all ranks' screen statistics at once: then any rank's state is the whole of it."""
-        self.density.add(self.team.pool(self.density.measure(output.projection)))
 
     def _control_density(self, taken: int) -> DensityReport | None:
         report = None
