@@ -109,7 +109,8 @@ class Ranks(Team):
         terms = torch.stack([losses.image, losses.mask, losses.depth, losses.total]).detach().float()
         with _peers():
             sum_over_ranks([*gradients, terms])
-        torch._foreach_mul_(gradients, 1 / self.size)
+        if gradients:
+            torch._foreach_div_(gradients, self.size)
         image, mask, depth, total = (terms / self.size).unbind()
         return Losses(image=image, mask=mask, depth=depth, total=total)
 
