@@ -9,23 +9,25 @@ Example: python benchmarks/kill_and_resume.py --moments 20
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
-import select
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.model.registry import MethodName
+
+SERVER = multiprocessing.get_context("forkserver")
 
 STAGES = (
     "before writing",
@@ -36,35 +38,59 @@ STAGES = (
 )
 """Moments inside the writing of a checkpoint."""
 
-_CHILD = """
-import os, signal, sys
-from pathlib import Path
-stage, count = os.environ.get("KILL_STAGE"), int(os.environ.get("KILL_COUNT", 1))
-if stage:
+PRELOADED = ["wildgs.cli.train", "wildgs.rasterize.cpu.backend", "torch.utils.tensorboard", "transformers"]
+"""Imported once by the server from which trainings are forked: kills are many, and imports slow."""
+
+
+def _kill_inside(stage: str, saves: int) -> None:
+    """Lets this process kill itself at a stage of its n-th checkpoint."""
     from wildgs.engine import checkpoint
-    left = [count]
-    def die():
-        os.kill(os.getpid(), signal.SIGKILL)
-    def now(name):
-        return stage == name and left[0] <= 0
+
+    left = saves
+
+    def die_at(name: str) -> None:
+        if stage == name and left <= 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
     save_file, flush, replace = checkpoint.save_file, checkpoint._flush, Path.replace
-    def saving(tensors, path, metadata):
-        left[0] -= 1
-        if now("before writing"): die()
+
+    def saving(tensors: dict[str, Any], path: Path, metadata: dict[str, str]) -> None:
+        nonlocal left
+        left -= 1
+        die_at("before writing")
         save_file(tensors, path, metadata=metadata)
-        if now("half written"):
-            os.truncate(path, path.stat().st_size // 2); die()
-        if now("written, not flushed"): die()
-    def flushing(path):
-        if path.is_dir() and now("renamed, old ones kept"): die()
+        if stage == "half written" and left <= 0:
+            os.truncate(path, path.stat().st_size // 2)
+        die_at("half written")
+        die_at("written, not flushed")
+
+    def flushing(path: Path) -> None:
+        if path.is_dir():
+            die_at("renamed, old ones kept")
         flush(path)
-    def replacing(self, target):
-        if self.suffix == ".partial" and "step_" in self.name and now("flushed, not renamed"): die()
+
+    def replacing(self: Path, target: Path) -> Path:
+        if self.name.startswith("step_"):
+            die_at("flushed, not renamed")
         return replace(self, target)
-    checkpoint.save_file, checkpoint._flush, Path.replace = saving, flushing, replacing
-from wildgs.cli import main
-main(sys.argv[1:])
-"""
+
+    checkpoint.save_file, checkpoint._flush = saving, flushing
+    Path.replace = replacing  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _child(arguments: list[str], output: Path, stage: str | None) -> None:
+    """One training: its output goes to a file, and it may kill itself."""
+    handle = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(handle, 1)
+    os.dup2(handle, 2)
+    sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115 - for the process's life
+    sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
+    from wildgs.cli import main, progress
+
+    progress.console.file = sys.stdout
+    if stage is not None:
+        _kill_inside(stage, 2)
+    main(arguments)
 
 
 @dataclass(frozen=True)
@@ -86,6 +112,8 @@ class Command:
 
 
 def main(command: Command) -> int:
+    os.environ["HF_HUB_OFFLINE"] = "1"  # a tiny landmark needs no pretrained weights
+    SERVER.set_forkserver_preload(PRELOADED)
     folder = Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
     try:
         return _run(command, folder)
@@ -137,42 +165,22 @@ def _train(
     arguments += ["--parsing.encoder", "nobody/none"]
     if (output / "config.yaml").is_file():
         arguments.append("--resume")
-    environment = os.environ | {"HF_HUB_OFFLINE": "1"}
-    if stage is not None:
-        environment |= {"KILL_STAGE": stage, "KILL_COUNT": "2"}
-    process = subprocess.Popen(
-        [sys.executable, "-u", "-c", _CHILD, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=environment,
-    )
-    try:
-        text = _wait_for(process, b"training ")
-        start = time.monotonic()
-        if delay is not None and stage is None:
-            time.sleep(delay)
-            process.kill()
-        rest, _ = process.communicate(timeout=500)
-    finally:
+    log = output.parent / "output.txt"
+    log.write_text("")
+    process = SERVER.Process(target=_child, args=([str(a) for a in arguments], log, stage), daemon=True)
+    process.start()
+    while process.is_alive() and "training " not in log.read_text():
+        time.sleep(0.05)
+    start = time.monotonic()
+    if delay is not None and stage is None:
+        time.sleep(delay)
         process.kill()
-    if process.returncode == -signal.SIGKILL:
+    process.join()
+    if process.exitcode == -signal.SIGKILL:
         return None
-    if process.returncode != 0:
-        raise SystemExit(f"training failed:\n{(text + rest).decode()}")
+    if process.exitcode != 0:
+        raise SystemExit(f"training failed:\n{log.read_text()}")
     return time.monotonic() - start
-
-
-def _wait_for(process: subprocess.Popen[bytes], word: bytes) -> bytes:
-    """Reads until training begins."""
-    assert process.stdout is not None
-    text = b""
-    while word not in text:
-        ready, _, _ = select.select([process.stdout], [], [], 300)
-        piece = os.read(process.stdout.fileno(), 4096) if ready else b""
-        if not piece:
-            break
-        text += piece
-    return text
 
 
 def _final(output: Path) -> tuple[str, int]:

@@ -117,7 +117,7 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
 class _Loader(yaml.SafeLoader):
     """Plain data without references, by which a small file can stand for more than memory holds."""
 
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             event = self.peek_event()
             raise yaml.composer.ComposerError(None, None, "references are not allowed", event.start_mark)

@@ -11,10 +11,11 @@ import torch
 
 from wildgs.data import Scene
 from wildgs.engine.autosave import Autosave, AutosaveConfig
+from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.safety import PATIENCE, TrainingDivergedError
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.model.registry import create_method
+from wildgs.model.registry import create_method, restore_method
 from wildgs.model.wildgs import WildGSConfig
 
 
@@ -54,7 +55,7 @@ def test_a_bad_step_is_skipped_and_named(wall_scene: Scene, monkeypatch, gradien
         means.append(trainer.method.gaussians.means.detach().clone())
 
     with pytest.warns(
-        WildGSWarning, match=r"step 3, photo \d\.jpg: the .*(gradient|loss term image)"
+        WildGSWarning, match=r"step \d, photo \d\.jpg: the .*(gradient|loss term image)"
     ) as caught:
         trainer.run([watch])
     assert len(caught) == 2
@@ -131,15 +132,14 @@ def report_at(step: int) -> StepReport:
 def test_saving_by_steps_and_by_time(monkeypatch) -> None:
     now = [0.0]
     monkeypatch.setattr("wildgs.engine.autosave.time.monotonic", lambda: now[0])
-    saved: list[int] = []
-    autosave = Autosave(
-        lambda: saved.append(1), AutosaveConfig(checkpoint_every=100, checkpoint_minutes=2), 0
-    )
+    saved: list[float] = []
+    config = AutosaveConfig(checkpoint_every=100, checkpoint_minutes=1.0)
+    autosave = Autosave(lambda: saved.append(now[0]), config, 0)
     for step in range(1, 251):
         now[0] += 1.0  # seconds
         autosave(report_at(step))
-    assert autosave.saved_step == 220, "100, then after two minutes 220; 200 was by steps"
-    assert len(saved) == 3
+    assert saved == [60.0, 100.0, 160.0, 200.0]
+    assert autosave.saved_step == 200
 
 
 def test_a_full_disk_does_not_end_training(monkeypatch) -> None:
@@ -152,7 +152,7 @@ def test_a_full_disk_does_not_end_training(monkeypatch) -> None:
         if len(attempts) < 3:
             raise UserError("step_1 cannot be written (No space left on device)")
 
-    autosave = Autosave(save, AutosaveConfig(checkpoint_every=10**6, checkpoint_minutes=1), 0)
+    autosave = Autosave(save, AutosaveConfig(checkpoint_every=10**6, checkpoint_minutes=1.0), 0)
 
     def train() -> None:
         for step in range(1, 300):
@@ -193,3 +193,21 @@ def test_records_of_steps_taken_again_are_dropped(wall_scene: Scene, tmp_path: P
     with Recorder(tmp_path, step=2):
         pass
     assert lines.read_text() == '{"step": 1}\n{"step": 2}\n'
+
+
+def test_a_resumed_run_with_other_photos_draws_a_new_round(wall_scene: Scene) -> None:
+    trainer = trainer_for(wall_scene, 10)
+    trainer.run([])
+    checkpoint = Checkpoint(trainer.state(), {})
+    method = restore_method("3dgs", WildGSConfig(), checkpoint.method)
+    fewer = Trainer(method, replace(wall_scene, views=wall_scene.views[:3]), TrainConfig(steps=20))
+    with pytest.warns(WildGSWarning, match="other photos than the 3"):
+        fewer.restore(checkpoint.state)
+    names: list[str] = []
+    fewer.run([lambda report: names.append(report.view.name)])
+    assert set(names) == {"0.jpg", "1.jpg", "2.jpg"}
+
+
+def test_a_run_without_steps_is_refused() -> None:
+    with pytest.raises(UserError, match="steps 0"):
+        TrainConfig(steps=0)

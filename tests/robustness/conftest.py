@@ -49,7 +49,7 @@ class Model:
         folder.mkdir(parents=True, exist_ok=True)
         camera = f"# a comment\n1 PINHOLE {self.size[0]} {self.size[1]} {' '.join(map(str, self.params))}\n"
         (folder / "cameras.txt").write_text(camera)
-        images = b"# a comment\n"
+        images = b"# Number of images: %d, mean observations per image: 0.5\n" % len(self.names)
         for index, name in enumerate(self.names):
             pose = " ".join(map(str, self.pose(index)))
             images += f"{index + 1} {pose} 1 ".encode() + name + b"\n" + (b"" if index % 2 else b"1.0 2.0 0")

@@ -59,7 +59,11 @@ TABLE: dict[str, dict[str, Cell]] = {
         "link loop": ("left out", r"p02\.png \(not a readable picture\)", "left out"),
     },
     "COLMAP binary": _MODEL,
-    "COLMAP text": _MODEL,
+    "COLMAP text": _MODEL
+    | {
+        "empty": ("error", "holds no photo with a pose", "error"),
+        "truncated": ("error", "the COLMAP model cannot be read", "error; between two lines: a warning"),
+    },
     "split .tsv": {
         "missing": ("used", "", "every 8th photo is held out"),
         "empty": ("error", "tab-separated columns", "error"),

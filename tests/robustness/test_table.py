@@ -228,6 +228,15 @@ def test_scenes(name: str, fault: str, scene: Path, make_model) -> None:
         assert len(views) == (6 if name == "depth" else 5)
 
 
+def test_a_text_cut_between_two_lines_is_noticed_by_its_comment(scene: Path, make_model) -> None:
+    spoil_model(scene, "names", make_model(), "txt")
+    path = scene / "sparse/0/images.txt"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:9]))
+    kind, said = observe(lambda: load_scene(scene, DataConfig(holdout=0)))
+    assert kind == "left out"
+    assert "declares 6 entries, and 4 are there" in said
+
+
 @pytest.fixture
 def run(scene: Path, tmp_path: Path) -> Path:
     """A run with two checkpoints."""
@@ -267,7 +276,8 @@ def test_checkpoints(fault: str, run: Path, monkeypatch) -> None:
         older.unlink()
         newest.unlink()
     elif fault == "wrong size":
-        save_file({"method.gaussians.rows.means": torch.zeros(3, 7)}, newest, metadata={"wildgs": "{}"})
+        means = {"method.gaussians.rows.means": torch.zeros(3, 7)}
+        save_file(state | means, newest, metadata={"wildgs": "{}"})
     elif fault == "NaN":
         means = {"method.gaussians.rows.means": torch.full((30, 3), float("nan"))}
         header = load_header(newest)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from wildgs.cli.train import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
+from wildgs.data.images import UnreadableImageError, open_image
 from wildgs.data.photos import SfmConfig
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
@@ -93,11 +95,9 @@ def _configure(command: Command, folder: Path) -> tuple[RunConfig, Scene]:
 
 def _downscale_for(folder: Path, long_side: int) -> float:
     """The factor that brings the largest photo to `long_side` pixels; 1 where it is smaller."""
-    from PIL import Image
-
-    sizes = []
+    sizes = [1]
     for path in sorted((folder / "images").rglob("*")):
         if path.is_file():
-            with Image.open(path) as image:
+            with contextlib.suppress(UnreadableImageError), open_image(path) as image:
                 sizes.append(max(image.size))
     return max(1.0, round(max(sizes) / long_side, 2))

@@ -124,7 +124,7 @@ def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> R
     wish = config.train.density.max_gaussians
     budget, word = plan_budget(config.method, scene, wish, default_device(), explicit=explicit)
     if word is not None:
-        warnings.warn(word, WildGSWarning, stacklevel=2)
+        console.print(word)
     return config if budget == wish else with_budget(config, budget)
 
 

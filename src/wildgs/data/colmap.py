@@ -14,7 +14,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from wildgs.data.colmap_files import ImageRecord, ModelFileError, ModelRecords, PointRecords, read_records
+from wildgs.data.colmap_binary import read_binary
+from wildgs.data.colmap_records import ImageRecord, ModelFileError, ModelRecords, PointRecords
+from wildgs.data.colmap_text import read_text
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.rotation import quats_to_rotations
 
@@ -93,9 +95,10 @@ def read_model(root: Path) -> ColmapModel:
         UserError: The model is missing, cannot be read, holds no photo with a pose or no point.
     """
     folder, images_dir = find_model(root)
+    binary = all((folder / name).is_file() for name in MODEL_FILES[0])
     try:
-        records = read_records(folder)
-    except ModelFileError as error:
+        records = read_binary(folder) if binary else read_text(folder)
+    except (ModelFileError, OSError, MemoryError) as error:
         raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
     registered = _usable(records, folder)
     with np.errstate(invalid="ignore"):

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from wildgs.engine.trainer import StepReport
-from wildgs.errors import WildGSWarning
+from wildgs.errors import UserError, WildGSWarning
 
 
 class Recorder:
@@ -29,14 +29,22 @@ class Recorder:
             scalars_every: Steps between log entries.
             pictures_every: Steps between pictures on tensorboard.
             step: Where the run stands; what an earlier, killed process recorded beyond it is dropped.
+
+        Raises:
+            UserError: The folder cannot be written to.
         """
         self.scalars_every = scalars_every
         self.pictures_every = pictures_every
-        folder.mkdir(parents=True, exist_ok=True)
         lines = folder / "metrics.jsonl"
-        _keep_until(lines, step)
-        self._lines = lines.open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _keep_until(lines, step)
+            self._lines = lines.open("a", encoding="utf-8")
+            self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+        except OSError as error:
+            raise UserError(
+                f"{folder} cannot be written to ({error}); make room, or mend its rights"
+            ) from error
         self._failed = False
 
     def __enter__(self) -> Recorder:

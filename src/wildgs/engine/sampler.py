@@ -43,7 +43,13 @@ class ViewSampler:
         """What `restore` needs."""
         return {"order": self.order.clone(), "position": torch.tensor(self.position)}
 
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Goes on where `state` was taken."""
-        self.order = state["order"]
-        self.position = int(state["position"])
+    def restore(self, state: dict[str, Tensor]) -> bool:
+        """Goes on where `state` was taken; a round over another number of photos is drawn anew.
+
+        Returns:
+            Whether it goes on in the same order.
+        """
+        same = len(state["order"]) in (0, self.count)
+        self.order = state["order"] if same else torch.empty(0, dtype=torch.int64)
+        self.position = int(state["position"]) if same else 0
+        return same

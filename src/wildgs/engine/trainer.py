@@ -48,6 +48,11 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
 
+    def __post_init__(self) -> None:
+        """Refuses a run without a step."""
+        if self.steps < 1:
+            raise UserError(f"steps {self.steps}: must be 1 or more")
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -189,13 +194,8 @@ class Trainer:
         """
         for index in self._candidates():
             view = self.views[index]
-            try:
-                view.read_photo()
+            if self._is_readable(view):
                 return view
-            except UserError as error:
-                if view.name not in self._unreadable:
-                    self._unreadable.add(view.name)
-                    warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
         raise UserError(
             f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
         )
@@ -213,6 +213,17 @@ class Trainer:
                 following = range(batch[rank] + 1, batch[rank] + len(self.views))
                 yield from (i % len(self.views) for i in following if i % len(self.views) not in batch)
                 return
+
+    def _is_readable(self, view: View) -> bool:
+        """Whether a photo can still be read; warns once where it cannot."""
+        try:
+            view.read_photo()
+        except UserError as error:
+            if view.name not in self._unreadable:
+                self._unreadable.add(view.name)
+                warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+            return False
+        return True
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo = view.read_photo().to(self.device).float() / 255
@@ -258,7 +269,7 @@ class Trainer:
     def _prepare(self) -> None:
         """Shows the method a few photos, spread over the collection."""
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
-        chosen = self.views[::stride][:PREPARATION_PHOTOS]
+        chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self._is_readable(view)]
         self.method.prepare([view.read_photo().to(self.device).float() / 255 for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
@@ -279,7 +290,9 @@ class Trainer:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Goes on from `state`; the method must have been restored from the same checkpoint already."""
         self.optimizers.restore(_under(state, "optimizer."))
-        self.sampler.restore(_under(state, "sampler."))
+        if not self.sampler.restore(_under(state, "sampler.")):
+            message = f"the run began with other photos than the {len(self.views)} that train now"
+            warnings.warn(f"{message}; it goes on with these", WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         if "random.torch" in state:  # files of the first version lack it

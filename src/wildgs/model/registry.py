@@ -47,6 +47,7 @@ def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tens
     """
     try:
         rows = {key.removeprefix(_ROWS): value for key, value in state.items() if key.startswith(_ROWS)}
+        _check_rows(rows, name, config)
         gaussians = Gaussians(rows)
         if name == "3dgs":
             method: Method = VanillaGS(gaussians)
@@ -58,3 +59,26 @@ def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tens
         first = str(error).splitlines()[0]
         raise UserError(f"the checkpoint does not fit method {name} as configured: {first}") from error
     return method
+
+
+def _check_rows(rows: dict[str, Tensor], name: MethodName, config: WildGSConfig) -> None:
+    """Whether all rows are there, each with its width and all with one length.
+
+    Raises:
+        KeyError: A row is missing.
+        RuntimeError: A row has another shape.
+    """
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (3,),
+        "quats": (4,),
+        "log_scales": (3,),
+        "opacity_logits": (),
+    }
+    if name == "3dgs":
+        shapes |= {"sh0": (1, 3), "shN": ((VanillaGS.sh_degree + 1) ** 2 - 1, 3)}
+    else:
+        shapes["intrinsic"] = (config.fusion.intrinsic_size,)
+    count = rows["means"].shape[0]
+    for row, shape in shapes.items():
+        if rows[row].shape != (count, *shape):
+            raise RuntimeError(f"{row} is {tuple(rows[row].shape)} where {(count, *shape)} is needed")
