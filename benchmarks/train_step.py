@@ -33,6 +33,7 @@ from torch import Tensor
 from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
@@ -163,14 +164,19 @@ def _tensors(value: Any) -> Iterator[Tensor]:
             yield from _tensors(part)
 
 
-def make_scene(folder: Path, long_side: int) -> Scene:
+def make_scene(folder: Path, long_side: int, photos: int = PHOTOS) -> Scene:
     """The demo's landmark."""
-    make_landmark(folder, SyntheticConfig(photos=PHOTOS, long_side=long_side))
+    make_landmark(folder, SyntheticConfig(photos=photos, long_side=long_side))
     return load_scene(folder, DataConfig(holdout=0))
 
 
 def make_trainer(
-    name: MethodName, scene: Scene, n: int, device: torch.device, model: WildGSConfig
+    name: MethodName,
+    scene: Scene,
+    n: int,
+    device: torch.device,
+    model: WildGSConfig,
+    team: Team | None = None,
 ) -> Trainer:
     """A trainer at the start of the second stage, with N Gaussians."""
     generator = torch.Generator().manual_seed(0)
@@ -179,7 +185,7 @@ def make_trainer(
     torch.manual_seed(0)
     method = create_method(name, model, scene.points[source] + noise, scene.point_colors[source])
     config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
-    trainer = Trainer(method.to(device), scene, config)
+    trainer = Trainer(method.to(device), scene, config, team)
     trainer.begin()
     trainer.step = trainer.schedule.first_stage + 1
     return trainer

@@ -11,3 +11,7 @@ class UserError(Exception):
 
 class WildGSWarning(UserWarning):
     """Something was left out and work goes on; the message says what is lost and how to get it."""
+
+
+class ReportedError(UserError):
+    """A mistake that another process of the same training tells the user about: this one ends in silence."""

@@ -15,6 +15,7 @@ import torch
 from wildgs.config import RunConfig, read_config, to_plain, write_config
 from wildgs.data import Alignment, Scene, load_scene
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
@@ -134,39 +135,54 @@ def refuse_trained(folder: Path) -> None:
         raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
 
 
-def prepare_training(folder: Path, config: RunConfig, scene: Scene, *, resume: bool) -> Trainer:
+def prepare_training(
+    folder: Path, config: RunConfig, scene: Scene, *, resume: bool, team: Team | None = None
+) -> Trainer:
     """A trainer at step 0, or at the newest whole checkpoint of a run that may have a lower budget now.
+
+    Of several processes, rank 0 alone reads and writes the run folder.
 
     Raises:
         UserError: As `start_training` and `resume_training` do.
     """
     if not resume:
-        return start_training(folder, config, scene)
-    stored = read_config(folder / CONFIG_FILE)
+        return start_training(folder, config, scene, team=team)
+    team = team or Team()
+    stored = team.from_first(lambda: read_config(folder / CONFIG_FILE))
     if config != stored:
-        write_config(folder / CONFIG_FILE, config)
-    trainer = resume_training(folder, scene)
+        team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
+    trainer = resume_training(folder, scene, team=team)
     if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
         # Saved at once, so that a run killed from here on goes on from this very state.
-        save_run(folder, trainer, config, scene.alignment)
+        team.from_first(lambda: save_run(folder, trainer, config, scene.alignment))
     return trainer
 
 
 def start_training(
-    folder: Path, config: RunConfig, scene: Scene, device: torch.device | None = None
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    device: torch.device | None = None,
+    team: Team | None = None,
 ) -> Trainer:
     """A trainer at step 0; writes the run's configuration.
 
     Raises:
         UserError: The folder already holds a trained run.
     """
+    team = team or Team()
+    team.from_first(lambda: _claim(folder, config))
+    with team.together():
+        torch.manual_seed(config.train.seed)
+        points, colors = _within_budget(scene, config)
+        method = create_method(config.method, config.model, points, colors)
+        return Trainer(method.to(device or default_device()), scene, config.train, team)
+
+
+def _claim(folder: Path, config: RunConfig) -> None:
     refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
-    torch.manual_seed(config.train.seed)
-    points, colors = _within_budget(scene, config)
-    method = create_method(config.method, config.model, points, colors)
-    return Trainer(method.to(device or default_device()), scene, config.train)
 
 
 def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:
@@ -184,7 +200,9 @@ def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch
     return scene.points[chosen], scene.point_colors[chosen]
 
 
-def resume_training(folder: Path, scene: Scene, device: torch.device | None = None) -> Trainer:
+def resume_training(
+    folder: Path, scene: Scene, device: torch.device | None = None, team: Team | None = None
+) -> Trainer:
     """A trainer at the newest whole checkpoint, with the configuration that the run began with.
 
     A run that was killed before its first checkpoint starts at step 0 again.
@@ -192,13 +210,14 @@ def resume_training(folder: Path, scene: Scene, device: torch.device | None = No
     Raises:
         UserError: The folder holds no run, or no checkpoint that is whole.
     """
-    config = read_config(folder / CONFIG_FILE)
-    checkpoint = newest_checkpoint(folder, set_aside=True)
+    team = team or Team()
+    config = team.from_first(lambda: read_config(folder / CONFIG_FILE))
+    checkpoint = team.from_first(lambda: newest_checkpoint(folder, set_aside=True))
     if checkpoint is None:
-        return start_training(folder, config, scene, device)
-    method = restore_method(config.method, config.model, checkpoint.method)
-    with _complete(folder):
-        trainer = Trainer(method.to(device or default_device()), scene, config.train)
+        return start_training(folder, config, scene, device, team)
+    with team.together(), _complete(folder):
+        method = restore_method(config.method, config.model, checkpoint.method)
+        trainer = Trainer(method.to(device or default_device()), scene, config.train, team)
         trainer.restore(checkpoint.state)
     return trainer
 

@@ -19,6 +19,10 @@ SIDE = 32
 
 @pytest.fixture
 def tiny_model() -> WildGSConfig:
+    return build_tiny_model()
+
+
+def build_tiny_model() -> WildGSConfig:
     return WildGSConfig(
         sky=SkyConfig(points=0),
         parsing=ParsingConfig(max_side=32),
@@ -28,6 +32,10 @@ def tiny_model() -> WildGSConfig:
 
 @pytest.fixture
 def wall_scene() -> Scene:
+    return build_wall_scene()
+
+
+def build_wall_scene() -> Scene:
     """Stripes on the plane z = 1, eight photos, every second one dark, one held out; disparity known."""
     x, y = torch.meshgrid(torch.linspace(-1, 1, 24), torch.linspace(-1, 1, 24), indexing="ij")
     points = torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(-1, 3)

@@ -7,8 +7,8 @@ import logging
 import sys
 import warnings
 
-from wildgs import __version__
-from wildgs.errors import UserError, WildGSWarning
+from wildgs import __version__, launch
+from wildgs.errors import ReportedError, UserError, WildGSWarning
 
 VERBS = {
     "demo": "the built-in landmark: train, score, write a page to look at",
@@ -24,6 +24,8 @@ VERBS = {
     "bench": "methods x ablations x seeds on scenes -> one table",
     "doctor": "what works on this machine, and how to get what does not",
 }
+DISTRIBUTED = ("train",)
+"""Verbs that torchrun may start on several processes."""
 USER_ERROR = 2
 logging.getLogger("wildgs").addHandler(logging.NullHandler())  # or Python prints what is logged a second time
 INTERRUPTED = 130
@@ -42,11 +44,16 @@ def main(arguments: list[str] | None = None) -> None:
     if verb not in VERBS:
         _fail(f"there is no verb {verb!r}; `wildgs --help` lists them")
     try:
+        if launch.world_size() > 1 and verb not in DISTRIBUTED:
+            raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
         _run(verb, rest)
+    except ReportedError:
+        sys.exit(USER_ERROR)
     except UserError as error:
         _fail(" ".join(str(error).split()))
     except KeyboardInterrupt as interrupt:
-        print(str(interrupt) or "interrupted", file=sys.stderr)
+        if not launch.rank():
+            print(str(interrupt) or "interrupted", file=sys.stderr)
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
 
 
@@ -65,12 +72,17 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object, *
     if issubclass(category, WildGSWarning):
         line = " ".join(str(message).split())
         logging.getLogger("wildgs").warning(line)
-        print(f"warning: {line}", file=sys.stderr)
+        print(f"{_speaker()}warning: {line}", file=sys.stderr)
 
 
 def _fail(message: str) -> None:
-    print(f"error: {message}", file=sys.stderr)
+    print(f"{_speaker()}error: {message}", file=sys.stderr)
     sys.exit(USER_ERROR)
+
+
+def _speaker() -> str:
+    """Names the process before its message, where it is one of several and not the first."""
+    return f"rank {launch.rank()}: " if launch.rank() else ""
 
 
 def _usage() -> str:

@@ -8,6 +8,7 @@ import threading
 from types import FrameType, TracebackType
 from typing import Any
 
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import StepReport
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -28,7 +29,13 @@ class InterruptedTrainingError(KeyboardInterrupt):
 class StopOnSignal:
     """An observer of training that ends it between two steps once a signal has come."""
 
-    def __init__(self) -> None:
+    def __init__(self, team: Team | None = None) -> None:
+        """Sets up a `StopOnSignal`.
+
+        Args:
+            team: The processes that train together: all of them end after the same step.
+        """
+        self.team = team or Team()
         self.received: int | None = None
         self._previous: dict[int, Any] = {}
 
@@ -50,7 +57,7 @@ class StopOnSignal:
     def _receive(self, number: int, _: FrameType | None) -> None:
         if self.received is not None:
             raise KeyboardInterrupt
-        self.received = number
+        self.received = self.team.wish = number
         # Not print(): the signal may have come in the middle of one.
         os.write(2, b"\nstopping after this step, then saving; once more stops at once, unsaved\n")
 
@@ -60,5 +67,5 @@ class StopOnSignal:
         Raises:
             InterruptedTrainingError: It has.
         """
-        if self.received is not None:
-            raise InterruptedTrainingError(f"interrupted at step {report.step}", self.received)
+        if self.team.verdict:
+            raise InterruptedTrainingError(f"interrupted at step {report.step}", self.team.verdict)

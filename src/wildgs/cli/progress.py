@@ -62,7 +62,7 @@ class TrainingProgress:
     def __call__(self, report: StepReport) -> None:
         """Shows a step."""
         last = report.step == self.steps
-        if report.step % REFRESH_STEPS and not last:
+        if not (report.falls_on(REFRESH_STEPS) or last):
             return
         self._loss = float(report.losses.total.detach())
         rate = (report.step - self.done) / max(time.monotonic() - self._started, 1e-6)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import warnings
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,8 +19,10 @@ from wildgs.cli.progress import TrainingProgress, console, counting
 from wildgs.config import RunConfig, read_config
 from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.engine.autosave import Autosave, AutosaveConfig
+from wildgs.engine.distributed import join
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import Observer, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import MethodName
@@ -68,24 +71,43 @@ class Command:
 
 
 def run(command: Command) -> None:
-    """Trains, with progress on the console."""
+    """Trains, with progress on the console; one of several processes where torchrun started it."""
+    with join() as team:
+        console.quiet = not team.first
+        _run(command, team)
+
+
+def _run(command: Command, team: Team) -> None:
     config = RunConfig(command.scene.resolve(), command.method, command.data, command.model, command.train)
     if command.resume:
-        config = replace(read_config(command.output / CONFIG_FILE), scene=config.scene)
+        stored = team.from_first(lambda: read_config(command.output / CONFIG_FILE))
+        config = replace(stored, scene=config.scene)
         if command.data.image_cache != DataConfig().image_cache:  # it has no influence on the result
             config = replace(config, data=replace(config.data, image_cache=command.data.image_cache))
     if command.max_gaussians is not None:
         config = with_budget(config, command.max_gaussians)
     if command.view:
         import_viser()  # a mistake is told before photos are read
-    with lock_run(command.output):
-        scene = read_scene(config)
+    window: Window | None = None
+    with ExitStack() as stack:
+        team.from_first(lambda: stack.enter_context(lock_run(command.output)))
+        with team.together():
+            scene = read_scene(config)
         if not command.resume:
-            refuse_trained(command.output)
-            config = plan_memory(config, scene, explicit=command.max_gaussians is not None)
-        window = Window(scene, command.server, command.output.resolve().name) if command.view else None
+            team.from_first(lambda: refuse_trained(command.output))
+            with team.together():
+                config = plan_memory(config, scene, explicit=command.max_gaussians is not None)
+            config = with_budget(config, team.least(config.train.density.max_gaussians))
+        if command.view and team.first:
+            window = Window(scene, command.server, command.output.resolve().name)
         train_within_memory(
-            command.output, config, scene, resume=command.resume, autosave=command.autosave, window=window
+            command.output,
+            config,
+            scene,
+            resume=command.resume,
+            autosave=command.autosave,
+            window=window,
+            team=team,
         )
     if window is not None:
         window.stay()
@@ -192,13 +214,14 @@ def train_within_memory(
     resume: bool,
     autosave: AutosaveConfig | None = None,
     window: Window | None = None,
+    team: Team | None = None,
 ) -> None:
     """Trains to the end; where the GPU's memory runs out, once more from the newest checkpoint with less.
 
     Raises:
         UserError: Memory ran out twice.
     """
-    lowered = _train_unless_full(folder, config, scene, resume, autosave, window)
+    lowered = _train_unless_full(folder, config, scene, resume, autosave, window, team)
     if lowered is None:
         return
     gc.collect()
@@ -208,7 +231,7 @@ def train_within_memory(
         f"the GPU's memory ran out; going on from the newest checkpoint with at most {budget:,} Gaussians"
     )
     warnings.warn(message, WildGSWarning, stacklevel=2)
-    if _train_unless_full(folder, lowered, scene, True, autosave, window) is not None:
+    if _train_unless_full(folder, lowered, scene, True, autosave, window, team) is not None:
         raise UserError(
             "the GPU's memory ran out again: go on with --resume and a lower --max-gaussians, or start anew with a "
             "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
@@ -221,20 +244,28 @@ def _train_unless_full(
     scene: Scene,
     resume: bool,
     autosave: AutosaveConfig | None,
-    window: Window | None,
+    window: Window | None = None,
+    team: Team | None = None,
 ) -> RunConfig | None:
     """Trains to the end, or returns the configuration to try next.
 
     What ran out of memory is freed when this returns: nothing else holds the trainer.
+
+    Raises:
+        UserError: Memory ran out on one of several processes: the others cannot be asked to try again.
     """
     trainer: Trainer | None = None
     try:
-        trainer = prepare_training(folder, config, scene, resume=resume)
+        trainer = prepare_training(folder, config, scene, resume=resume, team=team)
         observers = [] if window is None else [window.open(trainer)]
         train_to_end(folder, config, scene, trainer, autosave, observers)
-    except torch.OutOfMemoryError:
+    except torch.OutOfMemoryError as error:
         if window is not None:
             window.close()
+        if team is not None and team.size > 1:
+            raise UserError(
+                "a GPU's memory ran out: go on with --resume and a lower --max-gaussians"
+            ) from error
         count = len(scene.points) if trainer is None else len(trainer.method.gaussians)
         budget = min(count, config.train.density.max_gaussians)
         return with_budget(config, max(1, int(RETRY_SHARE * budget)))
@@ -260,7 +291,11 @@ def train_to_end(
     Raises:
         InterruptedTrainingError: A signal came; the last step is saved.
     """
-    label = f"training {config.method}"
+    team = trainer.team
+    if not team.first:
+        _follow(trainer)
+        return
+    label = f"training {config.method}" + (f" on {team.size} processes" if team.size > 1 else "")
     saver = Autosave(
         lambda: save_run(folder, trainer, config, scene.alignment), autosave or AutosaveConfig(), trainer.step
     )
@@ -268,13 +303,13 @@ def train_to_end(
         run_log(folder),
         Recorder(folder, step=trainer.step) as recorder,
         TrainingProgress(label, config.train.steps, trainer.step) as progress,
-        StopOnSignal() as stop,
+        StopOnSignal(team) as stop,
     ):
         logger.info("%s from step %d of %d", label, trainer.step, config.train.steps)
         try:
             trainer.run([recorder, progress, saver, stop, *observers])
         except InterruptedTrainingError as interrupt:
-            saver.save(trainer.step)
+            team.from_first(lambda: saver.save(trainer.step))
             interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
             raise
         saver.save(trainer.step)
@@ -284,6 +319,16 @@ def train_to_end(
         f"{label}: {trainer.step} steps in {minutes:.1f} min on {_device_name(trainer.device)}, "
         f"{len(trainer.method.gaussians):,} Gaussians -> {folder}"
     )
+
+
+def _follow(trainer: Trainer) -> None:
+    """Trains as one of rank 0's company, which writes and tells everything."""
+    with StopOnSignal(trainer.team) as stop:
+        try:
+            trainer.run([stop])
+        except InterruptedTrainingError:
+            trainer.team.from_first(lambda: None)  # waits until rank 0 has saved
+            raise
 
 
 def _device_name(device: torch.device) -> str:

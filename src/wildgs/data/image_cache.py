@@ -18,6 +18,7 @@ from pathlib import Path
 from wildgs.data.images import UnreadableImageError
 from wildgs.data.pictures import Pictures
 from wildgs.errors import UserError
+from wildgs.launch import local_world_size
 
 DECODERS = 4
 """Threads that decode photos; Pillow works without Python's lock."""
@@ -164,7 +165,10 @@ class CachedPictures:
 
 
 def available_memory() -> int | None:
-    """Bytes that a process can still take without swapping; None where the system does not say."""
+    """Bytes that a process can still take without swapping; None where the system does not say.
+
+    Processes that torchrun started on this machine get equal shares.
+    """
     found = []
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
@@ -184,4 +188,4 @@ def available_memory() -> int | None:
             found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
         except (AttributeError, ValueError, OSError):
             return None
-    return max(0, min(found))
+    return max(0, min(found)) // local_world_size()

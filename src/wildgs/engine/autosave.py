@@ -53,7 +53,7 @@ class Autosave:
 
     def __call__(self, report: StepReport) -> None:
         """Saves if it is time to; where that fails, warns and tries again a minute later."""
-        on_step = report.step % self.config.checkpoint_every == 0
+        on_step = report.falls_on(self.config.checkpoint_every)
         if report.skipped is not None or not (on_step or time.monotonic() >= self._due):
             return
         try:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.engine.optimizers import edit_rows, reset_moments
@@ -41,6 +42,21 @@ class DensityConfig:
     prune_reach: float = 0.15
     reset_opacity: float = 0.01
     max_gaussians: int = 3_000_000
+
+
+@dataclass(frozen=True)
+class ScreenStatistics:
+    """What views say about each Gaussian; N rows.
+
+    Attributes:
+        gradient_sum: Norms of the screen gradient, per half picture, added up over the views that see it.
+        seen: How many views do.
+        reach: Its largest radius, as a share of a picture's longer side.
+    """
+
+    gradient_sum: Float[Tensor, "N"]
+    seen: Float[Tensor, "N"]
+    reach: Float[Tensor, "N"]
 
 
 @dataclass(frozen=True)
@@ -81,18 +97,40 @@ class DensityControl:
         self.gradient_sum, self.seen, self.reach = (state[k] for k in ("gradient_sum", "seen", "reach"))
 
     @torch.no_grad()
-    def gather(self, projection: Projection) -> None:
-        """Adds one view's screen gradients and reaches; call after the backward pass."""
+    def gather(
+        self, projection: Projection, pool: Callable[[ScreenStatistics], ScreenStatistics] | None = None
+    ) -> None:
+        """Adds one view's screen gradients and reaches; call after the backward pass.
+
+        Args:
+            projection: Of that view.
+            pool: Makes one view's statistics those of several processes' views, at once: then what this holds
+                is the whole of it in any of them.
+        """
+        statistics = self.measure(projection)
+        if pool is not None:
+            statistics = pool(statistics)
+        device = statistics.seen.device
+        self.gradient_sum = self.gradient_sum.to(device) + statistics.gradient_sum
+        self.seen = self.seen.to(device) + statistics.seen
+        self.reach = torch.maximum(self.reach.to(device), statistics.reach)
+
+    @staticmethod
+    @torch.no_grad()
+    def measure(projection: Projection) -> ScreenStatistics:
+        """One view's screen gradients and reaches; zeros where no gradient reached the screen."""
         gradient = projection.means2d.grad
         if gradient is None:
-            return
-        half = torch.tensor([projection.camera.width / 2, projection.camera.height / 2]).to(gradient)
-        visible = projection.visible
+            zeros = torch.zeros_like(projection.means2d[:, 0])
+            return ScreenStatistics(zeros, zeros, zeros)
+        camera = projection.camera
+        half = torch.tensor([camera.width / 2, camera.height / 2]).to(gradient)
         norm = (gradient * half).norm(dim=-1)
-        self.gradient_sum = self.gradient_sum.to(norm.device) + torch.where(visible, norm, 0.0)
-        self.seen = self.seen.to(norm.device) + visible
-        share = projection.radii / max(projection.camera.width, projection.camera.height)
-        self.reach = torch.maximum(self.reach.to(norm.device), share)
+        return ScreenStatistics(
+            gradient_sum=torch.where(projection.visible, norm, 0.0),
+            seen=projection.visible.to(norm),
+            reach=(projection.radii / max(camera.width, camera.height)).to(norm),
+        )
 
     @torch.no_grad()
     def densify(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from jaxtyping import Bool
@@ -32,6 +33,8 @@ class OptimizerConfig:
         encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
             thousand steps, and the embedding of every photo becomes the same.
         network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
+        batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
+            rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
     """
 
     means: float = 1.6e-4
@@ -45,6 +48,7 @@ class OptimizerConfig:
     networks: float = 1e-3
     encoder: float = 1e-4
     network_decay: float = 0.1
+    batch_scaling: Literal["sqrt", "none"] = "sqrt"
 
 
 _ROW_RATES = {"log_scales": "scales", "opacity_logits": "opacities"}
@@ -57,47 +61,60 @@ class Optimizers:
     Attributes:
         rows: For `Gaussians.rows`; eps 1e-15 as 3DGS.
         networks: For everything else, or None where a method has nothing else.
+        photos: Photos in the mean gradient of one step.
     """
 
     config: OptimizerConfig
     extent: float
     rows: torch.optim.Adam
     networks: torch.optim.Adam | None = field(default=None)
+    photos: int = 1
 
     @classmethod
-    def build(cls, method: Method, config: OptimizerConfig, extent: float) -> Optimizers:
+    def build(cls, method: Method, config: OptimizerConfig, extent: float, photos: int = 1) -> Optimizers:
         """Optimisers for a method.
 
         Args:
             method: Whose parameters are optimised.
             config: Learning rates.
             extent: Radius of the cameras' region, world units (3DGS's spatial learning rate scale).
+            photos: Photos in the mean gradient of one step.
         """
+        scaled = photos if config.batch_scaling == "sqrt" else 1
+        rate, betas = scaled**0.5, (0.9**scaled, 0.999**scaled)
         groups = [
-            {"params": [parameter], "name": name, "lr": _row_rate(config, name, extent)}
+            {"params": [parameter], "name": name, "lr": rate * _row_rate(config, name, extent)}
             for name, parameter in method.gaussians.rows.items()
         ]
-        rows = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        rows = torch.optim.Adam(groups, betas=betas, eps=1e-15 / rate, fused=True)
         owned = {id(p) for p in method.gaussians.parameters()}
         encoder = [m for m in method.modules() if isinstance(m, Encoder)]
         encoder_parameters = [p for m in encoder for p in m.parameters()]
         owned |= {id(p) for p in encoder_parameters}
         others = [p for p in method.parameters() if id(p) not in owned]
         network_groups = [
-            {"params": others, "name": "networks", "lr": config.networks},
-            {"params": encoder_parameters, "name": "encoder", "lr": config.encoder},
+            {"params": others, "name": "networks", "lr": rate * config.networks},
+            {"params": encoder_parameters, "name": "encoder", "lr": rate * config.encoder},
         ]
         network_groups = [group for group in network_groups if group["params"]]
-        networks = torch.optim.Adam(network_groups, fused=True) if network_groups else None
-        return cls(config, extent, rows, networks)
+        networks = None
+        if network_groups:
+            networks = torch.optim.Adam(network_groups, betas=betas, eps=1e-8 / rate, fused=True)
+        return cls(config, extent, rows, networks, photos)
+
+    @property
+    def rate(self) -> float:
+        """Factor on every learning rate."""
+        return self.photos**0.5 if self.config.batch_scaling == "sqrt" else 1.0
 
     def set_progress(self, progress: float) -> None:
         """Moves every learning rate to where it belongs at a share of the run in [0, 1]."""
         config = self.config
-        decay = exponential(1.0, config.network_decay, progress)
+        decay = self.rate * exponential(1.0, config.network_decay, progress)
         for group in self.rows.param_groups:
             if group["name"] == "means":
-                group["lr"] = exponential(config.means, config.means_final, progress) * self.extent
+                rate = self.rate * self.extent
+                group["lr"] = rate * exponential(config.means, config.means_final, progress)
             elif group["name"] == "intrinsic":
                 group["lr"] = config.intrinsic * decay
         if self.networks is not None:
@@ -112,9 +129,12 @@ class Optimizers:
                 optimizer.zero_grad(set_to_none=True)
 
     def state(self) -> dict[str, Tensor]:
-        """Adam's moments and step counts, as flat tensors."""
+        """Adam's moments and step counts, as flat tensors.
+
+        Steps are counted in photos, so that training may go on with another number of photos a step.
+        """
         return {
-            f"{kind}.{index}.{key}": value
+            f"{kind}.{index}.{key}": value * self.photos if key == "step" else value
             for kind, index, parameter, optimizer in self._parameters()
             for key, value in optimizer.state.get(parameter, {}).items()
         }
@@ -126,7 +146,8 @@ class Optimizers:
             found = {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
             if found:
                 optimizer.state[parameter] = {
-                    key: _laid_out_as(parameter, value) for key, value in found.items()
+                    key: _laid_out_as(parameter, value / self.photos if key == "step" else value)
+                    for key, value in found.items()
                 }
 
     def _parameters(self) -> Iterator[tuple[str, int, Tensor, torch.optim.Adam]]:

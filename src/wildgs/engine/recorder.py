@@ -63,9 +63,9 @@ class Recorder:
     def __call__(self, report: StepReport) -> None:
         """Records a step, if it is one to be recorded; a disk that refuses ends the records, not the training."""
         try:
-            if report.step % self.scalars_every == 0 or report.skipped is not None:
+            if report.falls_on(self.scalars_every) or report.skipped is not None:
                 self._record_scalars(report)
-            if report.step % self.pictures_every == 0:
+            if report.falls_on(self.pictures_every):
                 self._record_pictures(report)
         except OSError as error:
             if not self._failed:

@@ -17,11 +17,23 @@ class ViewSampler:
 
     def next(self) -> int:
         """The next view's index."""
-        if self.position >= len(self.order):
-            self.order = torch.randperm(self.count, generator=self._generator)
-            self.position = 0
-        self.position += 1
-        return int(self.order[self.position - 1])
+        return self.take(1)[0]
+
+    def take(self, count: int) -> list[int]:
+        """The next `count` views' indices, all different; at most as many as there are views."""
+        taken = self.upcoming(count)
+        self.position += len(taken)
+        missing = count - len(taken)
+        if missing:
+            order = torch.randperm(self.count, generator=self._generator)
+            if taken:  # a round may not begin with the photos that end the one before, in the same step
+                repeated = torch.isin(order, torch.tensor(taken))
+                fresh = order[~repeated]
+                order = torch.cat([fresh[:missing], order[repeated], fresh[missing:]])
+            self.order = order
+            self.position = missing
+            taken += order[:missing].tolist()
+        return taken
 
     def upcoming(self, count: int) -> list[int]:
         """The next views' indices, as far as this round is drawn."""

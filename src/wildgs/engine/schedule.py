@@ -100,17 +100,23 @@ class Schedule:
         last = min(step, self.densify_until - 1) // self.reset_every * self.reset_every
         return last > 0 and step - last < self.mask_pause
 
-    def densifies(self, step: int) -> bool:
-        """Whether the Gaussians are densified after this step."""
-        return self.densify_from < step < self.densify_until and step % self.densify_every == 0
+    def densifies(self, step: int, taken: int = 1) -> bool:
+        """Whether the Gaussians are densified after this step, which counted for `taken`."""
+        due = falls_on(step, taken, self.densify_every)
+        return self.densify_from < step < self.densify_until and due
 
-    def resets(self, step: int) -> bool:
-        """Whether opacities are reset after this step."""
-        return 0 < step < self.densify_until and step % self.reset_every == 0
+    def resets(self, step: int, taken: int = 1) -> bool:
+        """Whether opacities are reset after this step, which counted for `taken`."""
+        return 0 < step < self.densify_until and falls_on(step, taken, self.reset_every)
 
     def gathers(self, step: int) -> bool:
         """Whether screen statistics are still needed."""
         return step < self.densify_until
+
+
+def falls_on(step: int, taken: int, every: int) -> bool:
+    """Whether a multiple of `every` lies among the last `taken` steps up to `step`."""
+    return step // every > (step - taken) // every
 
 
 def exponential(start: float, end: float, progress: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -17,7 +17,8 @@ from wildgs.engine.optimizers import OptimizerConfig, Optimizers
 from wildgs.engine.processor import settle_on_cpu
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
-from wildgs.engine.schedule import Schedule, ScheduleConfig
+from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
+from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
@@ -31,7 +32,7 @@ class TrainConfig:
     """Training.
 
     Attributes:
-        steps: How long (paper: 30,000; '†': 15,000).
+        steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
         seed: Of everything random.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
         objective: Loss weights.
@@ -66,6 +67,7 @@ class StepReport:
         num_gaussians: N after the step.
         density: What densification did, where it ran.
         skipped: Why the step was not taken, where its loss or gradient was no number.
+        taken: Steps that this one counts for: photos of all processes.
         seconds: Training time so far, without what observers take.
     """
 
@@ -77,6 +79,11 @@ class StepReport:
     density: DensityReport | None
     seconds: float
     skipped: str | None = None
+    taken: int = 1
+
+    def falls_on(self, every: int) -> bool:
+        """Whether this step is, or passed, a multiple of `every`."""
+        return falls_on(self.step, self.taken, every)
 
 
 Observer = Callable[[StepReport], None]
@@ -85,20 +92,27 @@ Observer = Callable[[StepReport], None]
 class Trainer:
     """Trains a method on a scene's training photos."""
 
-    def __init__(self, method: Method, scene: Scene, config: TrainConfig) -> None:
+    def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
         """Sets up a `Trainer`.
 
         Args:
             method: Trained in place, on the device on which its parameters are.
             scene: The photos; nothing of it under `truth/` is read.
             config: How.
+            team: The processes that train this model together; by default this one alone.
 
         Raises:
-            UserError: There is no photo to train on.
+            UserError: There is no photo to train on, or there are fewer than processes.
         """
         self.views = scene.train_views
+        self.team = team or Team()
         if not self.views:
             raise UserError(f"{scene.root}: no photo to train on; the split leaves none that has a camera")
+        if len(self.views) < self.team.size:
+            raise UserError(
+                f"{scene.root}: {len(self.views)} photos to train on are too few for {self.team.size} processes; "
+                f"use at most {len(self.views)}"
+            )
         self.method = method
         self.config = config
         self.device = method.gaussians.means.device
@@ -108,12 +122,13 @@ class Trainer:
         self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
-        self.optimizers = Optimizers.build(method, config.optimizer, extent)
+        self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.guard = StepGuard()
         self._unreadable: set[str] = set()
+        self._photos = ""
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -131,33 +146,48 @@ class Trainer:
             set_precision(self.method, torch.float32)
 
     def begin(self) -> None:
-        """Gets the method ready for `advance`; `run` does it by itself."""
+        """Gets the method ready for `advance`, the same on all ranks; `run` does it by itself.
+
+        Raises:
+            UserError: The ranks cannot train one model: their photos, models or versions differ.
+        """
         if self.device.type == "cpu":
             settle_on_cpu()
+        precision = choose_precision(self.config.precision, self.device)
+        self.team.require_same(same_everywhere(self.method, self.views, self.config, precision))
         if self.step == 0:
-            self._prepare()
-        set_precision(self.method, choose_precision(self.config.precision, self.device))
+            with self.team.together():
+                self._prepare()
+        self.team.share(self.method.state_dict().values())
+        self._verify()
+        set_precision(self.method, precision)
 
     def advance(self) -> StepReport:
-        """One step on one photo."""
+        """One step: a photo on every rank."""
         start = time.perf_counter()
         view = self._next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
         losses.total.backward()
-        fault = self.guard.judge(view.name, losses, self.method.parameters())
+        losses = self.team.average(self.method.parameters(), losses)
+        fault = self.guard.judge(self._photos, losses, self.method.parameters())
         if fault is None:
             if self.schedule.gathers(self.step):
-                self.density.gather(output.projection)
+                self.density.gather(output.projection, self.team.pool)
             self.optimizers.step()
         else:
             self.method.zero_grad(set_to_none=True)
-            self.guard.report(self.step + 1, fault, self.method)
-        self.step += 1
-        density = self._control_density()
+            with self.team.together():
+                self.guard.report(self.step + 1, fault, self.method)
+        before = self.step
+        self.step = min(before + self.team.size, self.config.steps)
+        taken = self.step - before
+        density = self._control_density(taken)
+        if falls_on(self.step, taken, VERIFY_EVERY) or self.step == self.config.steps:
+            self._verify()
         self.seconds += time.perf_counter() - start
         count = len(self.method.gaussians)
-        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault)
+        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault, taken)
 
     def _next_view(self) -> View:
         """The next photo that can be read; those after it are decoded in the background meanwhile.
@@ -165,15 +195,27 @@ class Trainer:
         Raises:
             UserError: None can be read any more.
         """
-        for _ in range(len(self.views)):
-            view = self.views[self.sampler.next()]
-            for index in self.sampler.upcoming(AHEAD):
-                self.views[index].prefetch()
+        for index in self._candidates():
+            view = self.views[index]
             if self._is_readable(view):
                 return view
         raise UserError(
             f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
         )
+
+    def _candidates(self) -> Iterator[int]:
+        """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
+        size, rank = self.team.size, self.team.rank
+        for _ in range(len(self.views)):
+            batch = self.sampler.take(size)
+            self._photos = ", ".join(self.views[index].name for index in batch)
+            for index in self.sampler.upcoming(AHEAD * size)[rank::size]:
+                self.views[index].prefetch()
+            yield batch[rank]
+            if size > 1:
+                following = range(batch[rank] + 1, batch[rank] + len(self.views))
+                yield from (i % len(self.views) for i in following if i % len(self.views) not in batch)
+                return
 
     def _is_readable(self, view: View) -> bool:
         """Whether a photo can still be read; warns once where it cannot."""
@@ -207,14 +249,14 @@ class Trainer:
         )
         return output, losses
 
-    def _control_density(self) -> DensityReport | None:
+    def _control_density(self, taken: int) -> DensityReport | None:
         report = None
-        if self.schedule.densifies(self.step):
+        if self.schedule.densifies(self.step, taken):
             large = self.step > self.schedule.reset_every
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )
-        if self.schedule.resets(self.step):
+        if self.schedule.resets(self.step, taken):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         return report
 
@@ -222,6 +264,10 @@ class Trainer:
         """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
         budget = self.config.density.max_gaussians
         return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+
+    def _verify(self) -> None:
+        if self.team.size > 1:
+            self.team.verify(self.step, {n: v for n, v in self.state().items() if n != "progress.seconds"})
 
     def _prepare(self) -> None:
         """Shows the method a few photos, spread over the collection."""

@@ -1,0 +1,78 @@
+"""What ranks exchange, without knowing what training is: sums over flat buckets, and fingerprints of tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from torch import distributed as dist
+
+BUCKET_ELEMENTS = 1 << 22
+"""Tensors smaller than this travel together, in messages of at most about twice so many numbers: 16 MB and more
+fill any network, and single messages for a network's hundreds of small tensors would wait for latency."""
+
+_CHUNK = 1 << 22
+_ODD = -7046029254386353131  # 2^64 / golden ratio as a signed number: spreads the positions of equal values
+
+
+@torch.no_grad()
+def sum_over_ranks(tensors: Sequence[Tensor]) -> None:
+    """Replaces every tensor by its sum over all ranks; afterwards all ranks hold the same bits.
+
+    Large tensors travel as they are, small ones in flat buckets. All messages are under way at once.
+
+    Args:
+        tensors: Of the same shapes in the same order on all ranks, in any memory layout; one dtype and device.
+    """
+    small = [tensor for tensor in tensors if tensor.numel() < BUCKET_ELEMENTS]
+    sent: list[tuple[list[Tensor], Tensor]] = []
+    for tensor in tensors:
+        if tensor.numel() >= BUCKET_ELEMENTS:
+            sent.append(([tensor], tensor if tensor.is_contiguous() else tensor.contiguous()))
+    for bucket in _buckets(small):
+        sent.append((bucket, torch.cat([tensor.reshape(-1) for tensor in bucket])))
+    waiting = [dist.all_reduce(flat, op=dist.ReduceOp.SUM, async_op=True) for _, flat in sent]
+    for work in waiting:
+        if work is not None:
+            work.wait()
+    for bucket, flat in sent:
+        if flat is not bucket[0]:
+            for tensor, part in zip(bucket, flat.split([t.numel() for t in bucket]), strict=True):
+                tensor.copy_(part.view(tensor.shape))
+
+
+def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    bucket: list[Tensor] = []
+    count = 0
+    for tensor in tensors:
+        bucket.append(tensor)
+        count += tensor.numel()
+        if count >= BUCKET_ELEMENTS:
+            yield bucket
+            bucket, count = [], 0
+    if bucket:
+        yield bucket
+
+
+@torch.no_grad()
+def fingerprints(state: Mapping[str, Tensor]) -> dict[str, int]:
+    """A 64-bit fingerprint of every tensor's bits, computed where the tensor lies.
+
+    Good against accidents: any single changed bit, and moved values, change it. Not against malice.
+    """
+    names = list(state)
+    sums = [_fingerprint(state[name].detach()) for name in names]
+    return dict(zip(names, (int(value) for value in sums), strict=True))
+
+
+def _fingerprint(tensor: Tensor) -> Int[Tensor, ""]:
+    flat = tensor.contiguous().reshape(-1).view(torch.uint8)
+    words = flat.view(torch.int32) if flat.numel() % 4 == 0 and flat.storage_offset() % 4 == 0 else flat
+    total = torch.zeros((), dtype=torch.int64, device=tensor.device)
+    for start in range(0, words.numel(), _CHUNK):
+        part = words[start : start + _CHUNK].long()
+        place = torch.arange(start + 1, start + 1 + part.numel(), device=tensor.device) * _ODD
+        total = total + ((part ^ (place >> 29)) * (place | 1)).sum()
+    return total + tensor.numel()

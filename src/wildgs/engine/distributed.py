@@ -1,0 +1,237 @@
+"""Training on several processes (ranks): `torchrun --nproc-per-node K -m wildgs train ...`.
+
+Every rank holds the whole model and takes another photo; gradients and screen statistics are pooled, and all that
+decides is the same everywhere, so the ranks stay identical to the bit. docs/scaling.md has the arithmetic.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch import distributed as dist
+
+from wildgs import launch
+from wildgs.engine.collectives import fingerprints, sum_over_ranks
+from wildgs.engine.density import ScreenStatistics
+from wildgs.engine.team import DivergedRanksError, LostRankError, Team
+from wildgs.errors import ReportedError, UserError, WildGSWarning
+from wildgs.losses.objective import Losses
+from wildgs.rasterize.cpu.threads import thread_count
+
+Result = TypeVar("Result")
+
+TIMEOUT = timedelta(minutes=10)
+"""How long a rank waits for another one that is silent but whose connection stands: the first use of the CPU's
+kernels compiles for minutes, and a checkpoint on a slow disk takes its time."""
+
+
+class Ranks(Team):
+    """One of several processes; `join` makes it."""
+
+    def __init__(self, control: dist.ProcessGroup) -> None:
+        """Sets up a `Ranks`.
+
+        Args:
+            control: A gloo group of all ranks, for what the host knows: it notices a lost rank at once, where
+                a GPU's collectives would wait for their timeout.
+        """
+        super().__init__()
+        self.rank = dist.get_rank()
+        self.size = dist.get_world_size()
+        self._control = control
+        self._verdict = 0
+
+    @property
+    def verdict(self) -> int:
+        """The highest signal that any rank had received before the last exchange."""
+        return self._verdict
+
+    @contextmanager
+    def together(self) -> Iterator[None]:  # noqa: D102 - as in Team
+        own: UserError | None = None
+        with warnings.catch_warnings():
+            if not self.first:
+                warnings.simplefilter("ignore", WildGSWarning)
+            try:
+                yield
+            except UserError as error:
+                own = error
+        messages = self._gather(None if own is None else str(own))
+        failed = [rank for rank, message in enumerate(messages) if message is not None]
+        if not failed:
+            return
+        if not self.first:
+            raise ReportedError(messages[failed[0]])
+        raise own if own is not None else UserError(f"rank {failed[0]}: {messages[failed[0]]}")
+
+    def from_first(self, function: Callable[[], Result]) -> Result:  # noqa: D102 - as in Team
+        result: list[Any] = [None]
+        with self.together():
+            if self.first:
+                result[0] = function()
+        with _peers():
+            dist.broadcast_object_list(result, src=0, group=self._control)
+        return result[0]
+
+    def least(self, value: int) -> int:  # noqa: D102 - as in Team
+        return min(self._gather(value))
+
+    def require_same(self, facts: Mapping[str, str]) -> None:  # noqa: D102 - as in Team
+        gathered = self._gather(dict(facts))
+        with self.together():
+            for name, value in gathered[0].items():
+                others = [rank for rank, found in enumerate(gathered) if found.get(name) != value]
+                if others:
+                    raise UserError(
+                        f"the ranks differ in their {name}: {value} on rank 0, {gathered[others[0]].get(name)} on "
+                        f"rank {others[0]}; give all of them the same command, scene and versions"
+                    )
+
+    def share(self, tensors: Iterable[Tensor]) -> None:  # noqa: D102 - as in Team
+        with _peers(), torch.no_grad():
+            for tensor in tensors:
+                whole = tensor.contiguous()
+                dist.broadcast(whole, src=0)
+                tensor.copy_(whole)
+
+    def average(self, parameters: Iterable[Tensor], losses: Losses) -> Losses:  # noqa: D102 - as in Team
+        trained = [parameter for parameter in parameters if parameter.requires_grad]
+        self._exchange_control(trained)
+        gradients = [parameter.grad for parameter in trained if parameter.grad is not None]
+        terms = torch.stack([losses.image, losses.mask, losses.depth, losses.total]).detach().float()
+        with _peers():
+            sum_over_ranks([*gradients, terms])
+        if gradients:
+            torch._foreach_div_(gradients, self.size)
+        image, mask, depth, total = (terms / self.size).unbind()
+        return Losses(image=image, mask=mask, depth=depth, total=total)
+
+    def _exchange_control(self, parameters: list[Tensor]) -> None:
+        """One small message ahead of the gradients: who has which, whether sizes agree, whether to stop."""
+        count = sum(parameter.numel() for parameter in parameters)
+        present = [int(parameter.grad is not None) for parameter in parameters]
+        message = torch.tensor([self.wish, count, -count, *present])
+        with _peers():
+            dist.all_reduce(message, op=dist.ReduceOp.MAX, group=self._control)
+        self._verdict, most, least, *present = message.tolist()
+        if most != -least:
+            raise DivergedRanksError(
+                f"the ranks' models differ in size ({-least:,} and {most:,} numbers); --resume goes on from the "
+                "newest checkpoint, which all ranks take from rank 0"
+            )
+        for parameter, somewhere in zip(parameters, present, strict=True):
+            if somewhere and parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+
+    def pool(self, statistics: ScreenStatistics) -> ScreenStatistics:  # noqa: D102 - as in Team
+        sums = torch.stack([statistics.gradient_sum, statistics.seen])
+        reach = statistics.reach.clone()
+        with _peers():
+            sum_over_ranks([sums])
+            dist.all_reduce(reach, op=dist.ReduceOp.MAX)
+        return ScreenStatistics(gradient_sum=sums[0], seen=sums[1], reach=reach)
+
+    def verify(self, step: int, state: Mapping[str, Tensor]) -> None:  # noqa: D102 - as in Team
+        gathered = self._gather(fingerprints(state))
+        for rank, found in enumerate(gathered):
+            unlike = [
+                name for name in gathered[0].keys() | found.keys() if gathered[0].get(name) != found.get(name)
+            ]
+            if unlike:
+                message = (
+                    f"rank {rank} and rank 0 do not hold the same model after step {step}: {len(unlike)} of "
+                    f"{len(found)} tensors differ, {min(unlike)} among them. A fault of memory or hardware, or "
+                    "machines that are not alike; --resume goes on from the newest checkpoint, from before"
+                )
+                raise DivergedRanksError(message) if self.first else ReportedError(message)
+
+    def _gather(self, value: Any) -> list[Any]:
+        gathered: list[Any] = [None] * self.size
+        with _peers():
+            dist.all_gather_object(gathered, value, group=self._control)
+        return gathered
+
+
+@contextmanager
+def _peers() -> Iterator[None]:
+    """Turns a broken connection into one line, told by the rank that notices first.
+
+    Raises:
+        LostRankError: On that rank.
+        ReportedError: On those that notice later.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        reason = (str(error).splitlines() or [""])[0]
+        message = (
+            "another process of this training ended or does not answer, so all of them stop (torchrun says below "
+            "which one failed first); the same command with --resume goes on from the newest checkpoint, with any "
+            f"number of processes. The connection said: {reason}"
+        )
+        raise (LostRankError(message) if _notices_first() else ReportedError(message)) from error
+
+
+def _notices_first() -> bool:
+    """Asks the store, which torchrun itself keeps: it outlives any rank."""
+    try:
+        return dist.distributed_c10d._get_default_store().add("wildgs/lost", 1) == 1
+    except RuntimeError:
+        return True
+
+
+@contextmanager
+def join() -> Iterator[Team]:
+    """Joins the processes that torchrun started; without it, a team of one.
+
+    Raises:
+        UserError: There are more processes than GPUs, or no connection.
+    """
+    if launch.world_size() == 1:
+        yield Team()
+        return
+    local = launch.local_rank()
+    _share_cores()
+    try:
+        if torch.cuda.is_available():
+            _take_gpu(local)
+            device = torch.device("cuda", local)
+            dist.init_process_group("nccl", timeout=TIMEOUT, device_id=device)
+        else:
+            dist.init_process_group("gloo", timeout=TIMEOUT)
+        control = dist.new_group(backend="gloo", timeout=TIMEOUT)
+    except (RuntimeError, ValueError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise UserError(f"the processes find no connection to each other: {reason}") from error
+    assert isinstance(control, dist.ProcessGroup)
+    yield Ranks(control)
+    # Not after an error: it would wait for ranks that are gone.
+    with contextlib.suppress(RuntimeError):
+        dist.destroy_process_group()
+
+
+def _take_gpu(local: int) -> None:
+    count = torch.cuda.device_count()
+    if local >= count:
+        raise UserError(
+            f"this machine has {count} GPUs for {launch.local_world_size()} processes; "
+            f"use --nproc-per-node {count}"
+        )
+    torch.cuda.set_device(local)
+
+
+def _share_cores() -> None:
+    """Divides a machine's cores among its processes, where torchrun put all of them on one core each."""
+    if os.environ.get("OMP_NUM_THREADS", "1") != "1":
+        return  # the user's choice
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    share = max(1, cores // launch.local_world_size())
+    torch.set_num_threads(thread_count() if "WILDGS_NUM_THREADS" in os.environ else share)
