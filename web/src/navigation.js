@@ -149,6 +149,14 @@ export class Navigation {
       for (const code of this.pressed) KEYS[code].forEach((value, axis) => (steps[axis] += value * speed));
       this.shift(steps);
     }
-    if (this.mode === "orbit") this.orbit.update();
+    if (this.mode === "orbit") this.coast();
+  }
+
+  /** The orbit's inertia. Its arithmetic moves a resting camera by a last bit, which would mean a new picture. */
+  coast() {
+    const [position, quaternion] = [this.camera.position.clone(), this.camera.quaternion.clone()];
+    if (this.orbit.update()) return;
+    this.camera.position.copy(position);
+    this.camera.quaternion.copy(quaternion);
   }
 }

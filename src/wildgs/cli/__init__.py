@@ -16,6 +16,7 @@ VERBS = {
     "train": "a scene with poses -> a trained run",
     "eval": "score a run on its held-out photos",
     "render": "pictures of a run's views under the light of any of its photos",
+    "export": "files for other programs, and one web page that carries the light",
     "depth": "fill a scene's depth/ with Depth Anything V2",
     "doctor": "what works on this machine, and how to get what does not",
 }

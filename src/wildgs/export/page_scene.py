@@ -122,7 +122,9 @@ def _pack_lights(
         least.append(low)
         step.append((high - low) / 255)
         for light, target in zip(lights, codes, strict=True):
-            values = np.rint((light[:, band].astype(np.float64) - low) / step[-1]).clip(0, 255).astype(np.uint8)
+            values = (
+                np.rint((light[:, band].astype(np.float64) - low) / step[-1]).clip(0, 255).astype(np.uint8)
+            )
             target[3 * degree**2 : 3 * (degree + 1) ** 2] = values.reshape(len(values), -1).T
     first = codes[0]
     return {"least": least, "step": step}, [first, *(other - first for other in codes[1:])]

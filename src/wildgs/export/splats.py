@@ -41,7 +41,9 @@ class Splats:
 
     def select(self, keep: Bool[Tensor, " N"]) -> Splats:
         """Those Gaussians that are True in `keep`."""
-        return Splats(self.means[keep], self.quats[keep], self.scales[keep], self.opacities[keep], self.sh[keep])
+        return Splats(
+            self.means[keep], self.quats[keep], self.scales[keep], self.opacities[keep], self.sh[keep]
+        )
 
     def with_sh(self, sh: Float[Tensor, "N K 3"]) -> Splats:
         """The same Gaussians in other colours."""

@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
+from wildgs.geometry.spherical_harmonics import sh_basis
 
 _DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
+
 
 def sh_degree(sh: Float[Tensor, "N K 3"]) -> int:
     """The degree of coefficients.
