@@ -158,7 +158,7 @@ async function open() {
   const header = JSON.parse(element("header").textContent);
   const scene = await readScene(header, element("scene").textContent);
   element("scene").remove();
-  const page = (window.__page = new Page(header, scene));
+  const page = new Page(header, scene);
   await page.settle();
   element("loading").hidden = true;
   document.documentElement.dataset.state = "ready";

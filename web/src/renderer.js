@@ -2,6 +2,10 @@
 
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
+import { FullScreenQuad } from "three/addons/postprocessing/Pass.js";
+
+// Splats are blended as the display's numbers, which are those that were trained; nothing is made linear.
+THREE.ColorManagement.workingColorSpace = THREE.SRGBColorSpace;
 
 const MIN_ALPHA = 1 / 255;
 const MAX_STD_DEV = Math.sqrt(2 * Math.log(255)); // where an opaque splat falls below MIN_ALPHA
@@ -31,6 +35,41 @@ function adapted(vertexShader) {
   );
 }
 
+/** Blends in half floats: skies are often brighter than white, and bytes would cut that off splat by splat. */
+class FloatCanvas {
+  constructor(renderer) {
+    this.renderer = renderer;
+    this.target = new THREE.WebGLRenderTarget(1, 1, { type: THREE.HalfFloatType, depthBuffer: false });
+    this.quad = new FullScreenQuad(
+      new THREE.RawShaderMaterial({
+        glslVersion: THREE.GLSL3,
+        uniforms: { picture: { value: this.target.texture } },
+        vertexShader: "in vec3 position; void main() { gl_Position = vec4(position, 1.0); }",
+        fragmentShader: `precision highp float;
+          uniform sampler2D picture;
+          out vec4 color;
+          void main() { color = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1.0); }`,
+        depthTest: false,
+        depthWrite: false,
+      }),
+    );
+  }
+
+  /** Whether this device blends into half floats. */
+  static supported(renderer) {
+    return renderer.extensions.has("EXT_color_buffer_float") || renderer.extensions.has("EXT_color_buffer_half_float");
+  }
+
+  draw(scene, camera) {
+    const size = this.renderer.getDrawingBufferSize(new THREE.Vector2());
+    this.target.setSize(size.x, size.y);
+    this.renderer.setRenderTarget(this.target);
+    this.renderer.render(scene, camera);
+    this.renderer.setRenderTarget(null);
+    this.quad.render(this.renderer);
+  }
+}
+
 /** A canvas that draws one scene. */
 export class Stage {
   constructor(canvas, splats, near) {
@@ -56,6 +95,7 @@ export class Stage {
     });
     const { material } = this.spark;
     material.vertexShader = adapted(material.vertexShader);
+    this.floats = FloatCanvas.supported(this.renderer) ? new FloatCanvas(this.renderer) : null;
     this.splats = splats;
     this.mesh = new SplatMesh({ splats, editable: false, raycastable: false, enableLod: false });
     this.scene.add(this.spark, this.mesh);
@@ -84,7 +124,8 @@ export class Stage {
     if (!this.wanted) return false;
     this.wanted = false;
     this.spark.dirty = false;
-    this.renderer.render(this.scene, this.camera);
+    if (this.floats) this.floats.draw(this.scene, this.camera);
+    else this.renderer.render(this.scene, this.camera);
     return true;
   }
 

@@ -56,13 +56,18 @@ class Splats:
             alignment: From the input's frame to that of the Gaussians.
         """
         back = alignment.inverse()
-        turn = rotations_to_quats(back.rotation[None]).to(self.quats)
+        turned = self.turned(back.rotation)
+        return replace(turned, means=back.apply_points(self.means), scales=self.scales * back.scale)
+
+    def turned(self, rotation: Float[Tensor, "3 3"]) -> Splats:
+        """The Gaussians after a turn of the world about its origin, colours included."""
+        turn = rotations_to_quats(rotation[None]).to(self.quats)
         return Splats(
-            means=back.apply_points(self.means),
+            means=self.means @ rotation.to(self.means).T,
             quats=_multiply(turn, torch.nn.functional.normalize(self.quats, dim=1)),
-            scales=self.scales * back.scale,
+            scales=self.scales,
             opacities=self.opacities,
-            sh=rotate_sh(self.sh, back.rotation),
+            sh=rotate_sh(self.sh, rotation),
         )
 
 
