@@ -92,16 +92,18 @@ def test_gaussforge_reads_the_spz_in_the_formats_own_axes(splats: Splats, tmp_pa
 
 
 def test_spz_holds_coordinates_far_from_the_origin(splats: Splats, tmp_path: Path) -> None:
-    far = Splats(
-        splats.means + 5000, splats.quats, splats.scales, splats.opacities, splats.sh[:, :1]
-    )
+    far = Splats(splats.means + 5000, splats.quats, splats.scales, splats.opacities, splats.sh[:, :1])
     file = tmp_path / "far.spz"
     write_splats(file, far, "spz")
     read = gaussforge.GaussForge().read(file.read_bytes(), "spz")["data"]
     places = np.frombuffer(read["positions"], "<f4").reshape(-1, 3)
     _close(places[:, 0], far.means[:, 0], 2e-3)
     with pytest.raises(UserError, match="too large for .spz"):
-        write_splats(file, Splats(far.means * 1e4, *(getattr(far, name) for name in ("quats", "scales", "opacities", "sh"))), "spz")
+        write_splats(
+            file,
+            Splats(far.means * 1e4, *(getattr(far, name) for name in ("quats", "scales", "opacities", "sh"))),
+            "spz",
+        )
 
 
 def test_splat_holds_places_sizes_and_flat_colours(splats: Splats, tmp_path: Path) -> None:

@@ -27,9 +27,7 @@ def test_rotated_harmonics_give_in_the_turned_direction_what_the_old_ones_gave(d
     rotation, directions = _rotation(1), _unit(20, 2)
     sh = torch.randn(5, num_sh_bases(degree), 3, generator=torch.Generator().manual_seed(3)).double()
     before = torch.einsum("dk,nkc->dnc", sh_basis(degree, directions), sh)
-    after = torch.einsum(
-        "dk,nkc->dnc", sh_basis(degree, directions @ rotation.T), rotate_sh(sh, rotation)
-    )
+    after = torch.einsum("dk,nkc->dnc", sh_basis(degree, directions @ rotation.T), rotate_sh(sh, rotation))
     torch.testing.assert_close(after, before)
 
 
