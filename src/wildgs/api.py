@@ -7,6 +7,7 @@ image = scene.render(scene.views[0].camera, look)
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -15,13 +16,18 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.data import Scene, View
+from wildgs.data.paths import make_path
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
 from wildgs.light.look import Look
 from wildgs.light.sources import LightSources, Progress
+from wildgs.light.timeline import Timeline
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import blend, sh_to_colors
 from wildgs.runs import Run, load_run
+
+LANDMARK_FILE = "landmarks.safetensors"
+"""In the run folder: what new photos are localised against, made when the first one comes."""
 
 
 class LoadedScene:
@@ -34,7 +40,7 @@ class LoadedScene:
     def __init__(self, run: Run) -> None:
         """Sets up a `LoadedScene`; `load` is the usual way."""
         self.run = run
-        self._sources = LightSources(run.method, lambda: self.scene)
+        self._sources = LightSources(run.method, lambda: self.scene, run.folder / LANDMARK_FILE)
 
     @cached_property
     def scene(self) -> Scene:
@@ -91,6 +97,42 @@ class LoadedScene:
             self.gaussians.means, look.sh, camera, degree=method.sh_degree, visible=projection.visible
         )
         return to_8bit(blend(projection, colors, depth=False).colors).cpu()
+
+    def frames(
+        self, cameras: Sequence[Camera], looks: Look | Sequence[Look]
+    ) -> Iterator[UInt8[Tensor, "H W 3"]]:
+        """Pictures along a trajectory, rendered as they are asked for.
+
+        Args:
+            cameras: From `path`, or any others in the scene's aligned frame.
+            looks: One, or several between which the light changes evenly from the first frame to the last.
+        """
+        timeline = Timeline.of(looks)
+        last = max(len(cameras) - 1, 1)
+        for number, camera in enumerate(cameras):
+            yield self.render(camera, timeline.at(number / last))
+
+    def path(
+        self,
+        kind: str | Path,
+        *,
+        frames: int = 150,
+        size: tuple[int, int] | None = None,
+        views: Sequence[str] = (),
+    ) -> list[Camera]:
+        """Cameras of a video, in the scene's aligned frame.
+
+        Args:
+            kind: `orbit`, `training` (past the places of the photos), `spiral`, `views` (through the photos named),
+                `still` (the photo named), or the path of a camera file (docs/cameras.md; also nerfstudio's).
+            frames: How many; a camera file has its own number.
+            size: Width and height of the pictures; None takes the photos' usual size, or the photo's or file's.
+            views: Names of photos, for `views` and `still`.
+
+        Raises:
+            UserError: There is no such path or photo, or the file cannot be read.
+        """
+        return make_path(self.scene, kind, frames=frames, size=size, views=views)
 
     @torch.no_grad()
     def depth(self, camera: Camera) -> Float[Tensor, "H W"]:

@@ -11,17 +11,6 @@ import torch
 
 from wildgs import api
 
-STEPS = 3
-
-
-@pytest.fixture(scope="module")
-def trained(landmark: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from wildgs.cli import main
-
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    main(["train", str(landmark), "--output", str(folder), "--steps", str(STEPS)])
-    return folder
-
 
 def _names(run: Path) -> list[str]:
     return [view.name for view in api.load(run).scene.train_views]

@@ -98,7 +98,7 @@ def test_spz_holds_coordinates_far_from_the_origin(splats: Splats, tmp_path: Pat
     read = gaussforge.GaussForge().read(file.read_bytes(), "spz")["data"]
     places = np.frombuffer(read["positions"], "<f4").reshape(-1, 3)
     _close(places[:, 0], far.means[:, 0], 2e-3)
-    with pytest.raises(UserError, match="too large for .spz"):
+    with pytest.raises(UserError, match=r"too large for \.spz"):
         write_splats(
             file,
             Splats(far.means * 1e4, *(getattr(far, name) for name in ("quats", "scales", "opacities", "sh"))),

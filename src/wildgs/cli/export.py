@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from wildgs import api
+from wildgs.cli.lights import MixOptions, find_looks
 from wildgs.cli.progress import console
-from wildgs.cli.webpage import baked, find_looks, page_looks, viewpoints_of, write_webpage
+from wildgs.cli.webpage import baked, page_looks, viewpoints_of, write_webpage
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
 from wildgs.export.cleanup import CleanupConfig, agreement, clean
@@ -36,15 +37,16 @@ class Command:
     format: tuple[SplatFormat | Literal["html"], ...] = ("html",)
     """One or several of html, ply, compressed.ply, splat, spz, sog."""
     appearance: tuple[str, ...] = ()
-    """Photos of the scene by name, pictures, saved appearances, or "neutral"; without any, four photos as
-    different as the scene has them for the page, and "neutral" for files."""
+    """Photos of the scene by name, files of new photos or any pictures, saved appearances, or neutral. Without
+    any, the page takes four photos as different as the scene has them, and other files are neutral."""
+    mix: Annotated[MixOptions, tyro.conf.arg(name="")] = field(default_factory=MixOptions)
     output: Path | None = None
     """Folder for the files; RUN/export unless given. With one file to write, it may be the file itself."""
     title: str | None = None
     """The page's headline; the scene's name unless given."""
     aligned: bool = False
     """Keep the frame of training (+z up, the photos' usual depth is 1) instead of the input's."""
-    cleanup: tyro.conf.OmitArgPrefixes[CleanupConfig] = field(default_factory=CleanupConfig)
+    cleanup: Annotated[CleanupConfig, tyro.conf.arg(name="")] = field(default_factory=CleanupConfig)
 
 
 def run(command: Command) -> None:
@@ -54,10 +56,11 @@ def run(command: Command) -> None:
     if not command.format:
         raise UserError("--format needs at least one of html, ply, compressed.ply, splat, spz, sog")
     loaded = api.load(command.run)
-    looks = find_looks(loaded, command.appearance or (NEUTRAL,)) if kinds or command.appearance else []
+    chosen = bool(command.appearance) or command.mix != MixOptions()
+    looks = find_looks(loaded, command.mix, command.appearance or (NEUTRAL,)) if kinds or chosen else []
     files = _files(command, looks, kinds)
     if with_page:
-        shown = looks if command.appearance else page_looks(loaded)
+        shown = looks if chosen else page_looks(loaded)
         _write_page(command, loaded, shown, alone=not files)
     for look in looks if kinds else ():
         _write_look(command, loaded, look, {kind: files[look, kind] for kind in kinds})

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 from rich.console import Console
 from rich.progress import (
@@ -99,6 +99,23 @@ def counting(label: str) -> Iterator[Counter]:
         return
     with _bar(MofNCompleteColumn()) as bar:
         yield Counter(label, bar)
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str, int, int], None]]:
+    """A callback `(stage, done, total)` that shows a bar, or a line, for each stage of long work."""
+    current: tuple[str, Counter] | None = None
+    with ExitStack() as stack:
+
+        def show(stage: str, done: int, total: int) -> None:
+            nonlocal current
+            if current is None or current[0] != stage:
+                stack.close()
+                current = stage, stack.enter_context(counting(stage))
+            if total:
+                current[1](done, total)
+
+        yield show
 
 
 def _bar(detail: TextColumn | MofNCompleteColumn) -> Progress:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
 
-from wildgs.cli.progress import Counter, console, counting
+from wildgs.cli.progress import console, stages
 from wildgs.data.photos import SfmConfig, SfmReport, reconstruct
 
 
@@ -43,17 +42,7 @@ def reconstruct_with_progress(
     photos: Path, output: Path, config: SfmConfig, *, overwrite: bool = False
 ) -> SfmReport:
     """`reconstruct` with a bar, or a line, for each of its steps."""
-    current: tuple[str, Counter] | None = None
-    with ExitStack() as stack:
-
-        def show(stage: str, done: int, total: int) -> None:
-            nonlocal current
-            if current is None or current[0] != stage:
-                stack.close()
-                current = stage, stack.enter_context(counting(stage))
-            if total:
-                current[1](done, total)
-
+    with stages() as show:
         return reconstruct(photos, output, config, overwrite=overwrite, progress=show)
 
 

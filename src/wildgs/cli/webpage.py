@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from wildgs.api import LoadedScene
-from wildgs.cli.progress import counting
+from wildgs.cli.lights import find_look
 from wildgs.cli.showcase import different_lights
 from wildgs.data import View
 from wildgs.errors import UserError
@@ -101,18 +101,7 @@ def page_looks(loaded: LoadedScene) -> list[Look]:
     if not loaded.relightable:
         return [loaded.appearance(NEUTRAL)]
     views = loaded.scene.train_views or loaded.views
-    return find_looks(loaded, [view.name for view in different_lights(views, PAGE_LIGHTS)])
-
-
-def find_looks(loaded: LoadedScene, specs: Sequence[str]) -> list[Look]:
-    """The looks that a user asks for, each once."""
-    looks: list[Look] = []
-    with counting("reading appearances") as progress:
-        for number, spec in enumerate(specs):
-            look = loaded.appearance(spec)
-            looks += [] if look in looks else [look]
-            progress(number + 1, len(specs))
-    return looks
+    return [find_look(loaded, view.name) for view in different_lights(views, PAGE_LIGHTS)]
 
 
 def baked(loaded: LoadedScene, look: Look) -> Splats:

@@ -7,6 +7,16 @@ import zlib  # noqa: F401
 import PIL.Image  # noqa: F401
 
 from wildgs.data.loading import DataConfig, load_scene
-from wildgs.data.scene import Alignment, Scene, Split, View, scene_extent
+from wildgs.data.scene import Alignment, Scene, Split, View, find_view, match_view, scene_extent
 
-__all__ = ["Alignment", "DataConfig", "Scene", "Split", "View", "load_scene", "scene_extent"]
+__all__ = [
+    "Alignment",
+    "DataConfig",
+    "Scene",
+    "Split",
+    "View",
+    "find_view",
+    "load_scene",
+    "match_view",
+    "scene_extent",
+]

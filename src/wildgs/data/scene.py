@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 
 Split = Literal["train", "test"]
@@ -143,3 +144,25 @@ def scene_extent(scene: Scene) -> float:
     radius = float((positions - centre).norm(dim=-1).max())
     distance = float((scene.points - centre).norm(dim=-1).median()) if len(scene.points) else 1.0
     return 1.1 * (radius if radius > 1e-3 * distance else distance)
+
+
+def find_view(scene: Scene, name: str) -> View:
+    """The view of a photo by its name, or its name without the ending.
+
+    Raises:
+        UserError: The scene has no such photo.
+    """
+    view = match_view(scene.views, name)
+    if view is None:
+        raise UserError(
+            f"{scene.root} has no photo {name!r} with a camera; names are as in its images/ folder"
+        )
+    return view
+
+
+def match_view(views: Sequence[View], name: str) -> View | None:
+    """The view of a photo by its name, or its name without the ending; None where there is none."""
+    for view in views:
+        if name in (view.name, str(Path(view.name).with_suffix(""))):
+            return view
+    return None

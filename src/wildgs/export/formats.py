@@ -51,7 +51,7 @@ def _by_gaussforge(splats: Splats, kind: SplatFormat) -> bytes:
 
 
 def _by_gsply(splats: Splats, kind: SplatFormat) -> bytes:
-    """gsply takes harmonics coefficient by coefficient, and writes to files only."""
+    """The package takes harmonics coefficient by coefficient, and writes to files only."""
     gsply = _package("gsply", kind)
     spz = kind == "spz"
     placed = splats.turned(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats

@@ -30,11 +30,13 @@ class Look:
         name: For people and for file names.
         embeddings: What `mix` mixes; None for a method that has one light only (plain 3DGS).
         method: The trained method to which the embeddings belong.
+        note: How the light was found, where that is worth a line to the user.
     """
 
     name: str
     embeddings: Embeddings | None = field(repr=False)
     method: Method = field(repr=False)
+    note: str = ""
 
     @cached_property
     def sh(self) -> Float[Tensor, "N K 3"]:
@@ -48,11 +50,10 @@ class Look:
 
 
 @torch.no_grad()
-def look_of(method: Method, appearance: Appearance, name: str) -> Look:
+def look_of(method: Method, appearance: Appearance, name: str, note: str = "") -> Look:
     """The look of an encoded photo."""
-    if not isinstance(method, WildGS):
-        return Look(name, None, method)
-    return Look(name, method.embed(appearance), method)
+    embeddings = method.embed(appearance) if isinstance(method, WildGS) else None
+    return Look(name, embeddings, method, note)
 
 
 def own_look(method: Method) -> Look:
@@ -62,9 +63,9 @@ def own_look(method: Method) -> Look:
 
 def mix(
     looks: Sequence[Look],
-    weights: Sequence[float],
+    weights: Sequence[float | int],
     *,
-    local_weights: Sequence[float] | None = None,
+    local_weights: Sequence[float | int] | None = None,
     name: str | None = None,
 ) -> Look:
     """Tuning: a look between others (paper, appendix Video Demo), at the cost of one shading, no encoding.
@@ -93,7 +94,7 @@ def mix(
     return Look(name, blend_embeddings(parts, weights, local), first.method)
 
 
-def _checked(looks: Sequence[Look], weights: Sequence[float]) -> list[float]:
+def _checked(looks: Sequence[Look], weights: Sequence[float | int]) -> list[float]:
     """The weights as they were given, but for rounding: scaled to add up to one exactly."""
     if len(weights) != len(looks):
         raise UserError(f"{len(looks)} appearances need {len(looks)} weights, not {len(weights)}")
@@ -103,8 +104,8 @@ def _checked(looks: Sequence[Look], weights: Sequence[float]) -> list[float]:
     return [float(weight) / total for weight in weights]
 
 
-def _describe(looks: Sequence[Look], weights: Sequence[float], local: Sequence[float]) -> str:
-    def sum_of(parts: Sequence[float]) -> str:
+def _describe(looks: Sequence[Look], weights: Sequence[float | int], local: Sequence[float | int]) -> str:
+    def sum_of(parts: Sequence[float | int]) -> str:
         return " + ".join(
             look.name if weight == 1 else f"{weight:.3g} {look.name}"
             for look, weight in zip(looks, parts, strict=True)

@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import torch
 from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from wildgs.data import Scene, View
-from wildgs.errors import UserError
+from wildgs.data import View, find_view, match_view
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
 from wildgs.model.method import Method
 
-
-def match_view(views: Sequence[View], name: str) -> View | None:
-    """The view of a photo by its name, or its name without the ending; None where there is none."""
-    for view in views:
-        if name in (view.name, str(Path(view.name).with_suffix(""))):
-            return view
-    return None
-
-
-def find_view(scene: Scene, name: str) -> View:
-    """The view of a photo by its name, or its name without the ending.
-
-    Raises:
-        UserError: The scene has no such photo.
-    """
-    view = match_view(scene.views, name)
-    if view is None:
-        raise UserError(
-            f"{scene.root} has no photo {name!r} with a camera; names are as in its images/ folder"
-        )
-    return view
+__all__ = ["cover", "encode_photo", "encode_picture", "encode_view", "find_view", "match_view"]
 
 
 @torch.no_grad()

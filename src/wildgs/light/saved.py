@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from wildgs.errors import UserError
 from wildgs.light.look import Look
@@ -50,7 +50,7 @@ def save_look(look: Look, file: Path) -> Path:
     }
     file.parent.mkdir(parents=True, exist_ok=True)
     aside = file.with_name(file.name + ".part")
-    save_file(tensors, aside, metadata={"wildgs": json.dumps(header)})
+    aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
     aside.replace(file)
     return file
 
@@ -72,6 +72,8 @@ def load_look(method: Method, file: Path) -> Look:
         shared, rows = tensors["shared_local"], tensors["rows"].long()
         name, owner, count = str(header["name"]), header["run"], int(header["gaussians"])
         global_embedding, inside = tensors["global_embedding"], tensors["local_embeddings"]
+        if len(rows) != len(inside) or bool(((rows < 0) | (rows >= count)).any()):
+            raise ValueError("rows of no Gaussian")
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
     if not isinstance(method, WildGS) or owner != fingerprint(method):

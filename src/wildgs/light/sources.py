@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
+from statistics import median
 
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from wildgs.data import Scene, View
+from wildgs.data import Scene, View, find_view, match_view
 from wildgs.data.images import UnreadableImageError, read_photo
-from wildgs.errors import UserError
+from wildgs.data.landmarks import Landmarks, load_landmarks
+from wildgs.data.localize import LocalizationError, localize
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.light.atlas import Atlas, make_atlas
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
-from wildgs.light.photos import encode_picture, encode_view, find_view, match_view
+from wildgs.light.photos import encode_photo, encode_picture, encode_view
 from wildgs.light.saved import SUFFIX, load_look
 from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
@@ -24,8 +28,11 @@ from wildgs.model.wildgs import WildGS
 AUTO = "auto"
 """As `like`: the training photo whose global embedding is nearest."""
 
+ONE_LIGHT = "the run is plain 3dgs, which has one light, its own, whatever photo is given"
+
 KEPT_LOOKS = 16
-"""Looks that are kept with their shaded harmonics, the last used."""
+KEPT_BYTES = 2_000_000_000
+"""Looks that are kept with their shaded harmonics, the last used: so many, and within so much memory."""
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and of how much."""
@@ -34,15 +41,20 @@ Progress = Callable[[str, int, int], None]
 class LightSources:
     """Finds the looks of one scene by what a user writes, and keeps the last few."""
 
-    def __init__(self, method: Method, open_scene: Callable[[], Scene]) -> None:
+    def __init__(
+        self, method: Method, open_scene: Callable[[], Scene], landmark_cache: Path | None = None
+    ) -> None:
         """Sets up `LightSources`.
 
         Args:
             method: The trained method.
             open_scene: Reads the scene when it is first needed: a saved appearance needs none.
+            landmark_cache: File that keeps what new photos are localised against.
         """
         self.method = method
         self._open_scene = open_scene
+        self._landmark_cache = landmark_cache
+        self._landmarks: Landmarks | None = None
         self._kept: OrderedDict[tuple[str, str | None], Look] = OrderedDict()
         self._atlas: Atlas | None = None
 
@@ -51,28 +63,36 @@ class LightSources:
         """The scene with its photos."""
         return self._open_scene()
 
+    @cached_property
+    def _own(self) -> Look:
+        return own_look(self.method)
+
     def find(self, spec: str | Path, *, like: str | None = None, progress: Progress | None = None) -> Look:
         """The look that a user asks for.
 
         In this order: `neutral`; a saved appearance (`*.safetensors`); a photo of the scene by its name, with or
-        without its ending; a file of a photo or picture.
+        without its ending; a file. A file is taken for a photo of the place and localised; where that fails (a
+        warning says how far it got), and where `like` is given, it is a picture of any kind and borrows a camera.
 
         Args:
             spec: One of the above.
-            like: For a file: the photo of the scene whose camera and depth it borrows, or `auto` for the training
-                photo that looks most like it.
+            like: The photo of the scene whose camera and depth a file borrows, or `auto` for the training photo
+                that looks most like it. None tries to localise first.
             progress: Told about long work.
 
         Raises:
             UserError: There is no such photo or file, or it cannot be read.
         """
         if not isinstance(self.method, WildGS):
-            return own_look(self.method)
+            if spec != NEUTRAL:
+                warnings.warn(f"{spec}: {ONE_LIGHT}", WildGSWarning, stacklevel=2)
+            return self._own
         key = (str(spec), like)
         if key not in self._kept:
             self._kept[key] = self._make(self.method, str(spec), like, progress or _silent)
         self._kept.move_to_end(key)
-        while len(self._kept) > KEPT_LOOKS:
+        size = 4 * 3 * (self.method.sh_degree + 1) ** 2 * self.method.num_gaussians
+        while len(self._kept) > max(2, min(KEPT_LOOKS, KEPT_BYTES // max(size, 1))):
             self._kept.popitem(last=False)
         return self._kept[key]
 
@@ -90,13 +110,41 @@ class LightSources:
                 f"{spec}: is neither a photo of {self.scene.root} (names are as in its images/ folder), nor a file,"
                 f" nor {NEUTRAL!r}"
             )
-        return self._borrow(method, file, like or AUTO, progress)
+        if like is None:
+            try:
+                return self._locate(method, file, progress)
+            except LocalizationError as error:
+                failure = str(error)
+        else:
+            failure = ""
+        look = self._borrow(method, file, like or AUTO, progress)
+        if failure:
+            warnings.warn(
+                f"{failure}; taken for a picture of another place: {look.note} (--like chooses another)",
+                WildGSWarning,
+                stacklevel=4,
+            )
+        return look
+
+    def _locate(self, method: WildGS, file: Path, progress: Progress) -> Look:
+        """The look of a new photo of the place."""
+        if self._landmarks is None:
+            self._landmarks = load_landmarks(
+                self.scene.root,
+                self._landmark_cache,
+                lambda done, total: progress("finding features of the scene's photos", done, total),
+            )
+        long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
+        found = localize(file, self._landmarks, self.scene.alignment, long_side)
+        appearance = encode_photo(method, found.photo, found.camera)
+        return look_of(method, appearance, file.name, found.describe())
 
     def _borrow(self, method: WildGS, file: Path, like: str, progress: Progress) -> Look:
         """The look of any picture, through the camera of a photo of the scene."""
         picture = read_picture(file)
         lender = find_view(self.scene, like) if like != AUTO else self._most_alike(method, picture, progress)
-        return look_of(method, encode_picture(method, picture, lender.camera), file.stem)
+        appearance = encode_picture(method, picture, lender.camera)
+        return look_of(method, appearance, file.name, f"camera and depth borrowed from {lender.name}")
 
     def _most_alike(self, method: WildGS, picture: UInt8[Tensor, "H W 3"], progress: Progress) -> View:
         atlas = self.atlas(progress)

@@ -1,0 +1,122 @@
+"""Frames to a video file or a folder of PNGs; nothing half-written ever has the final name."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from wildgs.errors import UserError
+
+SUFFIXES = (".mp4", ".mkv", ".mov")
+OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
+"""Endings by which someone asks for a file that is not written here, not for a folder."""
+
+CRF = 18
+"""x264's constant quality: 18 is hard to tell from the frames."""
+
+Frames = Iterable[UInt8[np.ndarray, "H W 3"]]
+
+
+def is_video(path: Path) -> bool:
+    """Whether a name asks for a video file rather than a folder."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def check_output(path: Path) -> None:
+    """Finds mistakes before hours of rendering.
+
+    Raises:
+        UserError: The name is of a video that cannot be written, or what a video needs is not installed.
+    """
+    if path.suffix.lower() in OTHER_MEDIA:
+        known = ", ".join(SUFFIXES)
+        raise UserError(f"{path}: videos end in {known}; a name without an ending makes a folder of PNGs")
+    if is_video(path):
+        if path.is_dir():
+            raise UserError(f"{path}: is a folder; give the name of a video file")
+        _ffmpeg()
+
+
+def _ffmpeg():
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise UserError(
+            "videos need imageio-ffmpeg: `pip install imageio-ffmpeg`; or give --output a folder for PNG frames"
+        ) from error
+    return imageio_ffmpeg
+
+
+def write_frames(path: Path, frames: Frames, size: tuple[int, int], fps: float) -> None:
+    """Writes a video (H.264, plays everywhere) or, for a name without an ending, a folder of PNGs.
+
+    Args:
+        path: File or folder.
+        frames: Pictures, taken one by one: they may be rendered as they are written.
+        size: Width and height of all of them; even numbers for a video.
+        fps: Frames per second.
+
+    Raises:
+        UserError: See `check_output`; or the video cannot be encoded.
+    """
+    check_output(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if is_video(path):
+        _write_video(path, frames, size, fps)
+    else:
+        _write_folder(path, frames)
+
+
+def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) -> None:
+    if size[0] % 2 or size[1] % 2:
+        raise UserError(f"{size[0]} x {size[1]}: a video's width and height must be even numbers")
+    with _aside(path) as folder:
+        part = folder / path.name
+        writer = _ffmpeg().write_frames(
+            str(part),
+            size,
+            fps=fps,
+            codec="libx264",
+            quality=None,
+            macro_block_size=2,
+            output_params=["-crf", str(CRF), "-movflags", "+faststart"],
+        )
+        try:
+            writer.send(None)
+            for frame in frames:
+                writer.send(np.ascontiguousarray(frame))
+        except OSError as error:
+            raise UserError(f"{path}: the video cannot be encoded: {str(error).splitlines()[0]}") from error
+        finally:
+            writer.close()
+        part.replace(path)
+
+
+def _write_folder(path: Path, frames: Frames) -> None:
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path}: is a file; give a folder for the frames")
+    with _aside(path) as folder:
+        for number, frame in enumerate(frames):
+            Image.fromarray(np.ascontiguousarray(frame)).save(folder / f"frame_{number:05d}.png")
+        path.mkdir(exist_ok=True)
+        for old in path.glob("frame_*.png"):
+            old.unlink()
+        for picture in sorted(folder.iterdir()):
+            picture.replace(path / picture.name)
+
+
+@contextmanager
+def _aside(path: Path) -> Iterator[Path]:
+    """A hidden folder on the same disk, gone afterwards whatever happens."""
+    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.part."))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,86 @@
+"""Appearance files: what goes in comes out, for the same checkpoint only, and nothing else is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from wildgs.errors import UserError
+from wildgs.light.look import look_of, mix, own_look
+from wildgs.light.photos import encode_view
+from wildgs.light.saved import load_look, save_look
+
+
+@pytest.fixture
+def look(method, wall):
+    parts = [look_of(method, encode_view(method, view), view.name) for view in wall.views[:2]]
+    return mix(parts, [0.25, 0.75])
+
+
+def test_round_trip(method, look, tmp_path: Path) -> None:
+    file = save_look(look, tmp_path / "sub" / "evening.safetensors")
+    back = load_look(method, file)
+    assert back.name == look.name
+    assert torch.equal(back.embeddings.global_embedding, look.embeddings.global_embedding)
+    torch.testing.assert_close(
+        back.embeddings.local_embeddings, look.embeddings.local_embeddings, atol=2e-3, rtol=2e-3
+    )
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+def test_only_gaussians_inside_the_box_are_stored(method, look, tmp_path: Path) -> None:
+    stored = load_file(save_look(look, tmp_path / "a.safetensors"))
+    inside = int(method.wrapping.box.contains(method.gaussians.means).sum())
+    assert 0 < inside < method.num_gaussians
+    assert len(stored["rows"]) == inside
+    assert stored["local_embeddings"].dtype == torch.float16
+
+
+def test_another_run_is_refused(other_method, look, tmp_path: Path) -> None:
+    file = save_look(look, tmp_path / "a.safetensors")
+    with pytest.raises(UserError, match="another run"):
+        load_look(other_method, file)
+
+
+def test_plain_3dgs_has_nothing_to_save(vanilla, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="one light"):
+        save_look(own_look(vanilla), tmp_path / "a.safetensors")
+
+
+def _strange_tensors(file: Path, look) -> None:
+    save_file({"x": torch.zeros(2)}, file, metadata={"wildgs": '{"format": "wildgs-appearance-1"}'})
+
+
+def _rows_out_of_range(file: Path, look) -> None:
+    from safetensors import safe_open
+
+    tensors = load_file(save_look(look, file))
+    with safe_open(file, framework="pt") as opened:
+        metadata = opened.metadata()
+    tensors["rows"][-1] = 10**6
+    save_file(tensors, file, metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda file, look: None, "no such file"),
+        (lambda file, look: file.write_bytes(b"PK no"), "no appearance file"),
+        (lambda file, look: save_file({"x": torch.zeros(2)}, file), "no appearance file"),
+        (_strange_tensors, "no appearance file"),
+        (_rows_out_of_range, "no appearance file"),
+    ],
+)
+def test_other_files_are_refused(method, look, tmp_path: Path, spoil, words) -> None:
+    file = tmp_path / "a.safetensors"
+    spoil(file, look)
+    with pytest.raises(UserError, match=words):
+        load_look(method, file)
+
+
+def test_the_name_must_end_as_it_is_found_again(look, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"end in \.safetensors"):
+        save_look(look, tmp_path / "evening.pt")
