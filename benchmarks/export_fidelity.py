@@ -64,9 +64,8 @@ def main() -> None:
                 print(f"{kind:16}{megabytes(file):8.2f}   not read back: no splat-transform on the PATH")
                 continue
             again = [picture(read, back.apply_camera(view.camera), back.scale) for view in views]
-            print(
-                f"{kind:16}{megabytes(file):8.2f}{pooled(original, again):16.2f}{shift(views, original, again):19.3f}"
-            )
+            same, moved = pooled(original, again), shift(views, original, again)
+            print(f"{kind:16}{megabytes(file):8.2f}{same:16.2f}{moved:19.3f}")
     print_degrees(loaded, whole, views, original)
 
 
