@@ -40,6 +40,10 @@ export class Lights {
   /** Shows a place on the slider: 0 is the first light, 1 the second, 0.5 half of each. */
   set(value) {
     this.stop();
+    this.place(value);
+  }
+
+  place(value) {
     const place = Math.min(this.count - 1, Math.max(0, value));
     const from = Math.min(Math.floor(place), Math.max(0, this.count - 2));
     this.show(from, Math.min(from + 1, this.count - 1), place - from, place);
@@ -56,15 +60,18 @@ export class Lights {
     this.blend(from, to, amount);
   }
 
-  /** Goes over to a light straight from the one that is on, without those between. */
+  /** Goes over to a light: straight from the one that is on, or along the slider from between two. */
   glide(target, then = () => {}) {
-    const from = Math.round(this.value);
     const start = this.value;
+    const from = Math.round(start);
+    const between = Math.abs(start - from) > 0.01;
     const began = performance.now();
     const step = (now) => {
       const time = Math.min(1, Math.max(0, (now - began) / GLIDE));
       const amount = time * time * (3 - 2 * time);
-      this.show(from, target, amount, start + (target - start) * amount);
+      const place = start + (target - start) * amount;
+      if (between || time === 1) this.place(place);
+      else this.show(from, target, amount, place);
       if (time < 1) this.animation = requestAnimationFrame(step);
       else then();
     };

@@ -66,7 +66,7 @@ def pack_scene(splats: Splats, lights: Sequence[Float[np.ndarray, "N K 3"]]) -> 
     planes += [(f"light{index}", codes) for index, codes in enumerate(colors)]
     header["planes"] = [[name, len(plane)] for name, plane in planes]
     data = b"".join(np.ascontiguousarray(plane).tobytes() for _, plane in planes)
-    return PackedScene(header, gzip.compress(data, compresslevel=9, mtime=0))
+    return PackedScene(header, gzip.compress(data, compresslevel=6, mtime=0))
 
 
 def _morton_order(means: Float[np.ndarray, "N 3"]) -> np.ndarray:
