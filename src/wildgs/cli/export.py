@@ -16,6 +16,7 @@ from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
 from wildgs.export.cleanup import CleanupConfig, agreement, clean
 from wildgs.export.formats import SplatFormat, write_splats
+from wildgs.export.splats import Splats
 from wildgs.light.look import NEUTRAL, Look
 
 COMPARED_VIEWS = 4
@@ -43,7 +44,7 @@ class Command:
     output: Path | None = None
     """Folder for the files; RUN/export unless given. With one file to write, it may be the file itself."""
     title: str | None = None
-    """The page's headline; the scene's name unless given."""
+    """The page's headline; the run folder's name unless given."""
     aligned: bool = False
     """Keep the frame of training (+z up, the photos' usual depth is 1) instead of the input's."""
     cleanup: Annotated[CleanupConfig, tyro.conf.arg(name="")] = field(default_factory=CleanupConfig)
@@ -87,7 +88,9 @@ def _write_page(command: Command, loaded: api.LoadedScene, looks: list[Look], *,
     file = command.output or command.run / "export"
     if not (alone and file.suffix == ".html"):
         file = file / PAGE_FILE
-    title = command.title or loaded.run.config.scene.name
+    title = command.title or command.run.resolve().name
+    if command.cleanup.active:
+        _cleaned(command, loaded, looks[0])
     page = write_webpage(loaded, looks, file, title=title, cleanup=command.cleanup)
     console.print(
         f"{page.file}: {page.megabytes:.1f} MB, {page.num_gaussians:,} Gaussians, lights: {len(looks)}, "
@@ -99,8 +102,18 @@ def _write_look(
     command: Command, loaded: api.LoadedScene, look: Look, files: dict[SplatFormat, Path]
 ) -> None:
     """One look in every format, cleaned up once."""
-    whole = baked(loaded, look)
-    scene = loaded.scene
+    splats = _cleaned(command, loaded, look)
+    placed = splats if command.aligned else splats.to_input_frame(loaded.run.alignment)
+    for kind, file in files.items():
+        write_splats(file, placed, kind)
+        console.print(
+            f"{file}: {file.stat().st_size / 1e6:.1f} MB, {len(placed):,} Gaussians under {look.name}"
+        )
+
+
+def _cleaned(command: Command, loaded: api.LoadedScene, look: Look) -> Splats:
+    """What stays of a look's Gaussians; prints how many those are, and the cost."""
+    whole, scene = baked(loaded, look), loaded.scene
     splats = clean(command.cleanup, whole, scene.points, viewpoints_of(scene.views))
     if not len(splats):
         raise UserError(
@@ -113,9 +126,4 @@ def _write_look(
             f"{look.name}: {len(splats):,} of {len(whole):,} Gaussians stay, harmonics of degree "
             f"{splats.sh_degree}; {same:.1f} dB PSNR against all of it, over {len(views)} views"
         )
-    placed = splats if command.aligned else splats.to_input_frame(loaded.run.alignment)
-    for kind, file in files.items():
-        write_splats(file, placed, kind)
-        console.print(
-            f"{file}: {file.stat().st_size / 1e6:.1f} MB, {len(placed):,} Gaussians under {look.name}"
-        )
+    return splats

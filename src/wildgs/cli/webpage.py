@@ -13,7 +13,6 @@ from wildgs.api import LoadedScene
 from wildgs.cli.lights import find_look
 from wildgs.cli.showcase import different_lights
 from wildgs.data import View
-from wildgs.errors import UserError
 from wildgs.export.cleanup import CleanupConfig, kept_rows
 from wildgs.export.page import Page, PageLight, PageView, write_page
 from wildgs.export.splats import Splats
@@ -62,7 +61,7 @@ def write_webpage(
         cleanup: What to leave out.
 
     Raises:
-        UserError: Nothing is left to show.
+        ValueError: Nothing is left to show.
     """
     cleanup = cleanup or CleanupConfig()
     scene = loaded.scene
@@ -70,10 +69,6 @@ def write_webpage(
     number, depth = choose_start([view.camera for view in views], scene.points)
     splats = baked(loaded, looks[0])
     keep = kept_rows(cleanup, splats, scene.points)
-    if not bool(keep.any()):
-        raise UserError(
-            "these options leave no Gaussian; lower --min-opacity, or raise --crop or --max-distance"
-        )
     lights = [
         PageLight(look.name, look.sh.cpu().detach()[keep], _thumbnail(loaded, look, views[number]))
         for look in looks
