@@ -23,8 +23,9 @@ from jaxtyping import Float, UInt8
 
 from wildgs.export.splats import Splats
 
-_TAIL = 5e-4
-"""Share of the coefficients beyond either end of a range: they are drawn in, so that the others get finer steps."""
+_TAIL = 2e-4
+"""Share of a light's coefficients beyond either end of a range: they are drawn in, so that the others get finer
+steps."""
 
 Planes = list[tuple[str, UInt8[np.ndarray, "C N"]]]
 
@@ -131,6 +132,7 @@ def _pack_lights(
 
 
 def _range(values: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Where nearly all values lie."""
-    low, high = np.quantile(np.concatenate([value.ravel() for value in values]), [_TAIL, 1 - _TAIL])
-    return float(low), float(max(high, low + 1e-6))
+    """Where nearly all values of every light lie."""
+    ends = np.stack([np.quantile(value, [_TAIL, 1 - _TAIL]) for value in values])
+    low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
+    return low, max(high, low + 1e-6)

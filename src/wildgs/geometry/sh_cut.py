@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
 
-_PRIOR = 0.02
+_PRIOR = 5e-4
 """Weight of the plain cut against the cameras' directions: decides where no camera looks."""
 
 
