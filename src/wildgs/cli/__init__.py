@@ -20,6 +20,7 @@ VERBS = {
     "gallery": "views x appearances of a run as one picture",
     "appearance": "the light of a photo, or a mix of several, as a small file",
     "view": "fly through a run in the browser, under any light",
+    "export": "files for other programs, and one web page that carries the light",
     "depth": "fill a scene's depth/ with Depth Anything V2",
     "bench": "methods x ablations x seeds on scenes -> one table",
     "doctor": "what works on this machine, and how to get what does not",

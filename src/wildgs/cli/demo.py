@@ -9,6 +9,7 @@ from wildgs.cli.eval import evaluate_run, print_scores
 from wildgs.cli.progress import console, counting
 from wildgs.cli.showcase import Scores, write_showcase
 from wildgs.cli.train import read_scene, train_or_go_on
+from wildgs.cli.webpage import write_scene_page
 from wildgs.config import RunConfig
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig
@@ -39,7 +40,7 @@ class Command:
     """
 
     output: Path = Path("wildgs-demo")
-    """Folder for the scene, both runs and report.html."""
+    """Folder for the scene, both runs, report.html and scene.html."""
     steps: int = 1500
     """Training steps of each method."""
     photos: int = 40
@@ -77,7 +78,10 @@ def run(command: Command) -> None:
         runs.append((TITLES[method], loaded, scores))
     print_scores({name: scores for name, _, scores in runs})
     write_showcase(page, "Wild-GS demo", SUMMARY.format(photos=command.photos), scene, runs)
-    console.print(f"open {page.resolve()} in a browser")
+    scene_page = command.output / "scene.html"
+    write_scene_page(runs[0][1], scene_page, "Wild-GS demo")
+    console.print(f"open {page.resolve()} in a browser: scores and comparisons")
+    console.print(f"open {scene_page.resolve()} in a browser: the scene, to fly through in any light")
 
 
 def _training(steps: int) -> TrainConfig:

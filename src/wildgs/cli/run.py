@@ -13,6 +13,7 @@ from wildgs.cli.progress import console, counting
 from wildgs.cli.sfm import print_report, reconstruct_with_progress
 from wildgs.cli.showcase import Scores, write_showcase
 from wildgs.cli.train import read_scene, train_or_go_on
+from wildgs.cli.webpage import write_scene_page
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
@@ -69,8 +70,12 @@ def run(command: Command) -> None:
         print_scores({str(command.output): scores})
     page = command.output / "report.html"
     summary = f"{len(scene.views)} photos from {command.photos.name}, {loaded.step} steps of Wild-GS."
-    write_showcase(page, command.photos.resolve().name, summary, scene, [("Wild-GS", loaded, scores)])
-    console.print(f"open {page.resolve()} in a browser")
+    title = command.photos.resolve().name
+    write_showcase(page, title, summary, scene, [("Wild-GS", loaded, scores)])
+    scene_page = command.output / "scene.html"
+    write_scene_page(loaded, scene_page, title)
+    console.print(f"open {page.resolve()} in a browser: scores and comparisons")
+    console.print(f"open {scene_page.resolve()} in a browser: the scene, to fly through in any light")
 
 
 def estimate_depth(folder: Path) -> None:

@@ -1,0 +1,104 @@
+"""Smaller exports: Gaussians and harmonics left out, and what that costs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wildgs.export.splats import Splats
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.sh_cut import cut_sh, fit_cut
+from wildgs.geometry.spherical_harmonics import num_sh_bases
+from wildgs.model.gaussians import NEAR
+from wildgs.model.triplane import robust_box
+from wildgs.rasterize import rasterize
+
+BOX_QUANTILE = 0.02
+"""Share of the SfM points that a crop to the box leaves out on each side of each axis."""
+
+
+@dataclass(frozen=True)
+class CleanupConfig:
+    """What an export leaves out.
+
+    Attributes:
+        min_opacity: Gaussians fainter than this are dropped.
+        max_distance: Gaussians further from the scene's middle are dropped, in units of the photos' usual depth;
+            None keeps all.
+        crop: Gaussians outside the box that holds nearly all SfM points, times this, are dropped: 1 is that
+            box; None keeps all.
+        sh_degree: Spherical harmonics above this degree are left out (fitted to the photos' directions).
+    """
+
+    min_opacity: float = 0.0
+    max_distance: float | None = None
+    crop: float | None = None
+    sh_degree: int | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether anything may be left out."""
+        return self != CleanupConfig()
+
+
+def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:
+    """Which Gaussians stay.
+
+    Args:
+        config: What to leave out.
+        splats: In the scene's aligned frame.
+        points: SfM points in the same frame; their median is the scene's middle.
+    """
+    keep = splats.opacities >= config.min_opacity
+    if config.max_distance is not None:
+        middle = points.median(dim=0).values.to(splats.means)
+        keep &= (splats.means - middle).norm(dim=1) <= config.max_distance
+    if config.crop is not None:
+        box = robust_box(points, BOX_QUANTILE, config.crop)
+        low, high = box.low.to(splats.means), box.high.to(splats.means)
+        keep &= ((splats.means >= low) & (splats.means <= high)).all(dim=1)
+    return keep
+
+
+def clean(
+    config: CleanupConfig,
+    splats: Splats,
+    points: Float[Tensor, "P 3"],
+    viewpoints: Float[Tensor, "V 3"],
+) -> Splats:
+    """The Gaussians without what the configuration leaves out.
+
+    Args:
+        config: What to leave out.
+        splats: In the scene's aligned frame.
+        points: SfM points.
+        viewpoints: Camera centres, to whose directions lower harmonics are fitted.
+    """
+    kept = splats.select(kept_rows(config, splats, points)) if config.active else splats
+    if config.sh_degree is None or num_sh_bases(config.sh_degree) >= kept.sh.shape[1]:
+        return kept
+    fit = fit_cut(kept.means, viewpoints, kept.sh_degree, config.sh_degree) if len(viewpoints) else None
+    return kept.with_sh(cut_sh(kept.sh, config.sh_degree, fit))
+
+
+def agreement(first: Splats, second: Splats, cameras: Sequence[Camera]) -> float:
+    """PSNR between the pictures of two sets of Gaussians, dB: pooled over all cameras, infinite where equal."""
+    errors = []
+    for camera in cameras:
+        one, other = (_picture(splats, camera) for splats in (first, second))
+        errors.append((one - other).square().mean())
+    return float(-10 * torch.log10(torch.stack(errors).mean()))
+
+
+@torch.no_grad()
+def _picture(splats: Splats, camera: Camera) -> Float[Tensor, "H W 3"]:
+    """As it is shown: rounded to 8 bits."""
+    rendering = rasterize(
+        splats.means, splats.quats, splats.scales, splats.opacities, splats.sh.contiguous(), camera,
+        sh_degree=splats.sh_degree, near=NEAR, depth=False,
+    )  # fmt: skip
+    return (rendering.colors.double().clamp(0, 1) * 255).round() / 255

@@ -1,0 +1,171 @@
+"""One web page that holds a scene and its lights: opens from disk, asks nobody for anything."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from wildgs.export.page_scene import PackedScene, pack_scene
+from wildgs.export.splats import Splats
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.sh_cut import cut_sh, fit_cut
+
+BUDGET_BYTES = 25_000_000
+"""Size below which the page stays by giving up degrees of the spherical harmonics."""
+
+THUMBNAIL = (288, 192)
+_QUALITY = 82
+
+
+@dataclass(frozen=True)
+class PageLight:
+    """One light of the page.
+
+    Attributes:
+        name: Below its thumbnail.
+        sh: Spherical harmonics of all Gaussians.
+        thumbnail: A picture of any size; its middle is shown.
+    """
+
+    name: str
+    sh: Float[Tensor, "N K 3"]
+    thumbnail: UInt8[np.ndarray, "_ _ 3"]
+
+
+@dataclass(frozen=True)
+class PageView:
+    """Where the page opens.
+
+    Attributes:
+        camera: In the scene's aligned frame (+z up).
+        depth: How far before it lies what one orbits about, world units.
+    """
+
+    camera: Camera
+    depth: float
+
+
+@dataclass(frozen=True)
+class Page:
+    """All that the page shows.
+
+    Attributes:
+        title: Its headline.
+        summary: A sentence behind its question mark.
+        splats: Geometry, in the scene's aligned frame.
+        lights: From left to right.
+        start: Where it opens.
+        near: Near plane, world units.
+    """
+
+    title: str
+    summary: str
+    splats: Splats
+    lights: Sequence[PageLight]
+    start: PageView
+    near: float
+
+
+def write_page(
+    page: Page,
+    file: Path,
+    *,
+    viewpoints: Float[Tensor, "V 3"] | None = None,
+    sh_degree: int | None = None,
+) -> int:
+    """Writes the page, aside first and then renamed, so that no half page is ever left.
+
+    Args:
+        page: What to show.
+        file: The HTML file; its folder is made where it is missing.
+        viewpoints: Camera centres, for whose directions lower harmonics are fitted.
+        sh_degree: Degree of the spherical harmonics; None takes the highest with which the page stays below
+            `BUDGET_BYTES`.
+
+    Returns:
+        The degree of the spherical harmonics that the page carries.
+
+    Raises:
+        ValueError: The page has no light or no Gaussian.
+    """
+    own = page.splats.sh_degree
+    text = ""
+    for degree in range(own, -1, -1) if sh_degree is None else [min(sh_degree, own)]:
+        text = _compose(page, _pack(page, degree, viewpoints))
+        if len(text) <= BUDGET_BYTES:
+            break
+    file.parent.mkdir(parents=True, exist_ok=True)
+    aside = file.with_name(f".{file.name}.part")
+    aside.write_text(text, encoding="utf-8")
+    aside.replace(file)
+    return degree
+
+
+def _pack(page: Page, degree: int, viewpoints: Float[Tensor, "V 3"] | None) -> PackedScene:
+    fit = None
+    if degree < page.splats.sh_degree and viewpoints is not None and len(viewpoints):
+        fit = fit_cut(page.splats.means, viewpoints, page.splats.sh_degree, degree)
+    return pack_scene(page.splats, [cut_sh(light.sh, degree, fit).numpy() for light in page.lights])
+
+
+def _compose(page: Page, scene: PackedScene) -> str:
+    """The HTML text."""
+    web = files("wildgs.export").joinpath("web")
+    header = {
+        **scene.header,
+        "near": page.near,
+        "start": _start(page.start),
+        "lights": [{"name": light.name, "thumbnail": _thumbnail(light.thumbnail)} for light in page.lights],
+    }
+    return Template(web.joinpath("page.html").read_text(encoding="utf-8")).substitute(
+        title=escape(page.title),
+        summary=escape(page.summary),
+        style=web.joinpath("style.css").read_text(encoding="utf-8"),
+        licenses=escape(web.joinpath("LICENSES.txt").read_text(encoding="utf-8")),
+        header=script_json(header),
+        scene=base64.b64encode(scene.data).decode("ascii"),
+        viewer=base64.b64encode(web.joinpath("viewer.js.gz").read_bytes()).decode("ascii"),
+    )
+
+
+def script_json(value: Any) -> str:
+    """JSON that ends no script element, whatever a photo is called."""
+    return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _start(view: PageView) -> dict[str, Any]:
+    camera = view.camera
+    target = camera.position + view.depth * camera.forward
+    return {
+        "position": camera.position.tolist(),
+        "target": target.tolist(),
+        "fov_y": float(2 * torch.atan(0.5 * camera.height / camera.K[1, 1])),
+        "aspect": float(camera.width / camera.height * camera.K[1, 1] / camera.K[0, 0]),
+    }
+
+
+def _thumbnail(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
+    """The picture's middle as a data URL."""
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    wide, tall = THUMBNAIL
+    scale = max(wide / image.width, tall / image.height)
+    size = (max(wide, round(image.width * scale)), max(tall, round(image.height * scale)))
+    image = image.resize(size, Image.Resampling.LANCZOS)
+    left, top = (image.width - wide) // 2, (image.height - tall) // 2
+    buffer = io.BytesIO()
+    image.crop((left, top, left + wide, top + tall)).save(buffer, "JPEG", quality=_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -1,0 +1,138 @@
+"""The scene inside the web page: geometry once, then the colours of each light, in few bytes.
+
+Everything is quantised to bytes and stored in planes (all first bytes, then all second bytes, ...), Gaussians in
+Morton order, so that neighbours in space are neighbours in the file and gzip finds what they share. Lights after
+the first are stored as differences from it, modulo 256. `web/src/scene.js` reads this.
+
+    means      asinh of each coordinate, 24 bits between the least and the largest, high byte first
+    scales     logarithm, 8 bits
+    opacities  8 bits
+    quats      the three smallest of (x, y, z, w) in 10 bits each, which one is left out in 2; low byte first
+    light<i>   spherical harmonics, 8 bits, a range per degree; base function by base function, r g b each
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from wildgs.export.splats import Splats
+
+_TAIL = 2e-4
+"""Share of a light's coefficients beyond either end of a range: they are drawn in, so that the others get finer
+steps."""
+
+Planes = list[tuple[str, UInt8[np.ndarray, "C N"]]]
+
+
+@dataclass(frozen=True)
+class PackedScene:
+    """A scene as the page carries it.
+
+    Attributes:
+        header: Counts and ranges, for JSON.
+        data: The planes, gzipped.
+    """
+
+    header: dict[str, Any]
+    data: bytes
+
+
+def pack_scene(splats: Splats, lights: Sequence[Float[np.ndarray, "N K 3"]]) -> PackedScene:
+    """Packs geometry and the colours of all lights.
+
+    Args:
+        splats: The geometry; its own colours are not read.
+        lights: Spherical harmonics under each light, all of one degree.
+
+    Raises:
+        ValueError: No light, or no Gaussian.
+    """
+    if not lights or not len(splats):
+        raise ValueError("a page needs at least one light and one Gaussian")
+    order = _morton_order(splats.means.numpy())
+    header: dict[str, Any] = {"count": len(order), "sh_degree": int(np.sqrt(lights[0].shape[1])) - 1}
+    planes: Planes = []
+    header["means"], means = _pack_means(splats.means.numpy()[order])
+    header["scales"], scales = _pack_scales(splats.scales.numpy()[order])
+    opacities = np.rint(splats.opacities.numpy()[order].clip(0, 1) * 255).astype(np.uint8)
+    planes += [("means", means), ("scales", scales), ("opacities", opacities[None])]
+    planes += [("quats", _pack_quats(splats.quats.numpy()[order]))]
+    header["colors"], colors = _pack_lights([light[order] for light in lights])
+    planes += [(f"light{index}", codes) for index, codes in enumerate(colors)]
+    header["planes"] = [[name, len(plane)] for name, plane in planes]
+    data = b"".join(np.ascontiguousarray(plane).tobytes() for _, plane in planes)
+    return PackedScene(header, gzip.compress(data, compresslevel=6, mtime=0))
+
+
+def _morton_order(means: Float[np.ndarray, "N 3"]) -> np.ndarray:
+    """Indices along a curve that visits near points one after the other."""
+    places = np.arcsinh(means.astype(np.float64))
+    low, high = places.min(axis=0), places.max(axis=0)
+    cells = ((places - low) / np.maximum(high - low, 1e-12) * 0x1FFFFF).astype(np.uint64)
+    code = np.zeros(len(means), np.uint64)
+    for bit in range(21):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def _pack_means(means: Float[np.ndarray, "N 3"]) -> tuple[dict[str, Any], UInt8[np.ndarray, "9 N"]]:
+    places = np.arcsinh(means.astype(np.float64))
+    low, high = places.min(axis=0), places.max(axis=0)
+    steps = np.rint((places - low) / np.maximum(high - low, 1e-12) * 0xFFFFFF).astype(np.uint32)
+    planes = [(steps[:, axis] >> shift) & 255 for axis in range(3) for shift in (16, 8, 0)]
+    return {"least": low.tolist(), "most": high.tolist()}, np.stack(planes).astype(np.uint8)
+
+
+def _pack_scales(scales: Float[np.ndarray, "N 3"]) -> tuple[dict[str, Any], UInt8[np.ndarray, "3 N"]]:
+    logs = np.log(np.maximum(scales.astype(np.float64), 1e-9))
+    low, high = float(logs.min()), float(logs.max())
+    step = max(high - low, 1e-6) / 255
+    return {"least": low, "step": step}, np.rint((logs - low) / step).astype(np.uint8).T
+
+
+def _pack_quats(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "4 N"]:
+    """Smallest three; quats are (w, x, y, z) here and (x, y, z, w) in the page."""
+    unit = np.roll(quats.astype(np.float64), -1, axis=1)
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+    largest = np.abs(unit).argmax(axis=1)
+    sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    kept = np.arange(4)[None] != largest[:, None]
+    small = (unit * sign)[kept].reshape(-1, 3)
+    codes = np.rint((small / np.sqrt(2.0) + 0.5).clip(0, 1) * 1023).astype(np.uint32)
+    words = codes[:, 0] | codes[:, 1] << 10 | codes[:, 2] << 20 | largest.astype(np.uint32) << 30
+    return np.stack([(words >> shift) & 255 for shift in (0, 8, 16, 24)]).astype(np.uint8)
+
+
+def _pack_lights(
+    lights: Sequence[Float[np.ndarray, "N K 3"]],
+) -> tuple[dict[str, Any], list[UInt8[np.ndarray, "C N"]]]:
+    """Codes of all lights in ranges that they share, so that the page can mix them."""
+    bases = lights[0].shape[1]
+    least, step = [], []
+    codes = [np.empty((3 * bases, light.shape[0]), np.uint8) for light in lights]
+    for degree in range(int(np.sqrt(bases))):
+        band = slice(degree**2, (degree + 1) ** 2)
+        low, high = _range([light[:, band] for light in lights])
+        least.append(low)
+        step.append((high - low) / 255)
+        for light, target in zip(lights, codes, strict=True):
+            values = (
+                np.rint((light[:, band].astype(np.float64) - low) / step[-1]).clip(0, 255).astype(np.uint8)
+            )
+            target[3 * degree**2 : 3 * (degree + 1) ** 2] = values.reshape(len(values), -1).T
+    first = codes[0]
+    return {"least": least, "step": step}, [first, *(other - first for other in codes[1:])]
+
+
+def _range(values: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Where nearly all values of every light lie."""
+    ends = np.stack([np.quantile(value, [_TAIL, 1 - _TAIL]) for value in values])
+    low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
+    return low, max(high, low + 1e-6)

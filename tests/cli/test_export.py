@@ -1,0 +1,76 @@
+"""`wildgs export`: every format from one tiny run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from wildgs import api
+
+
+def _names(run: Path) -> list[str]:
+    return [view.name for view in api.load(run).scene.train_views]
+
+
+def test_the_page_holds_the_lights_asked_for(wildgs, trained: Path, tmp_path: Path, capsys) -> None:
+    names = _names(trained)[:2]
+    file = tmp_path / "gate.html"
+    assert wildgs("export", trained, "--appearance", *names, "--output", file, "--title", "The gate") == 0
+    text = file.read_text(encoding="utf-8")
+    header = json.loads(text.split('id="header">')[1].split("</script>")[0])
+    assert [light["name"] for light in header["lights"]] == names
+    assert "<title>The gate</title>" in text
+    assert str(file) in capsys.readouterr().out
+
+
+def test_without_appearances_the_page_takes_four_photos(wildgs, trained: Path, tmp_path: Path) -> None:
+    assert wildgs("export", trained, "--output", tmp_path) == 0
+    header = (
+        (tmp_path / "page.html").read_text(encoding="utf-8").split('id="header">')[1].split("</script>")[0]
+    )
+    assert len({light["name"] for light in json.loads(header)["lights"]}) == 4
+
+
+def test_a_file_is_baked_for_each_appearance_in_the_inputs_frame(
+    wildgs, trained: Path, tmp_path: Path
+) -> None:
+    gsply = pytest.importorskip("gsply")
+    names = _names(trained)[:2]
+    assert wildgs("export", trained, "--format", "ply", "--appearance", *names, "--output", tmp_path) == 0
+    loaded = api.load(trained)
+    for name in names:
+        read = gsply.plyread(tmp_path / f"{Path(name).stem}.ply")
+        back = loaded.run.alignment.apply_points(torch.from_numpy(np.array(read.means)))
+        torch.testing.assert_close(back, loaded.gaussians.means.detach(), atol=1e-4, rtol=1e-4)
+    assert wildgs("export", trained, "--format", "ply", "--appearance", names[0], "--aligned", "--output",
+                  tmp_path / "one.ply") == 0  # fmt: skip
+    read = gsply.plyread(tmp_path / "one.ply")
+    np.testing.assert_array_equal(read.means, loaded.gaussians.means.detach().numpy())
+    np.testing.assert_array_equal(read.sh0, loaded.appearance(names[0]).sh[:, 0].numpy())
+
+
+def test_what_is_left_out_and_its_cost_are_printed(wildgs, trained: Path, tmp_path: Path, capsys) -> None:
+    name = _names(trained)[0]
+    assert wildgs("export", trained, "--format", "ply", "--appearance", name, "--output", tmp_path,
+                  "--min-opacity", "0.09", "--sh-degree", "1", "--crop", "1") == 0  # fmt: skip
+    assert "dB PSNR against all of it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--appearance", "nobody.jpg"], "nobody.jpg"),
+        (["--format", "ply", "--min-opacity", "2"], "leave no Gaussian"),
+    ],
+)
+def test_mistakes_are_one_line(wildgs, trained: Path, tmp_path: Path, capsys, arguments, message) -> None:
+    names = [] if "--appearance" in arguments else ["--appearance", _names(trained)[0]]
+    assert wildgs("export", trained, "--output", tmp_path / "out", *arguments, *names) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: ")
+    assert message in error
+    assert not (tmp_path / "out").exists()
