@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from wildgs.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from wildgs.api import LoadedScene as LoadedScene
     from wildgs.api import load as load
     from wildgs.light.look import Look as Look
     from wildgs.light.look import mix as mix
-
-__version__ = "0.1.0"
 
 _HOMES = {
     "load": "wildgs.api",

@@ -7,8 +7,9 @@ import logging
 import sys
 import warnings
 
-from wildgs import __version__, launch
+from wildgs import launch
 from wildgs.errors import ReportedError, UserError, WildGSWarning
+from wildgs.version import __version__
 
 VERBS = {
     "demo": "the built-in landmark: train, score, write a page to look at",

@@ -12,7 +12,6 @@ import torch
 import tyro
 from rich.table import Table
 
-from wildgs import __version__
 from wildgs.cli.bench_plan import (
     LABELS,
     METHODS,
@@ -25,7 +24,7 @@ from wildgs.cli.bench_plan import (
 )
 from wildgs.cli.eval import evaluate_run
 from wildgs.cli.progress import console
-from wildgs.cli.train import read_scene, train_to_end
+from wildgs.cli.training import read_scene, train_to_end
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.engine.checkpoint import list_checkpoints
@@ -40,6 +39,7 @@ from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import CHECKPOINT_FOLDER, load_run, resume_training, start_training
+from wildgs.version import __version__
 
 PROTOCOLS: tuple[Protocol, ...] = ("full", "half")
 MOST_NOTES = 12

@@ -12,7 +12,7 @@ from wildgs.cli.eval import evaluate_run, print_scores
 from wildgs.cli.progress import console, counting
 from wildgs.cli.sfm import print_report, reconstruct_with_progress
 from wildgs.cli.showcase import Scores, write_showcase
-from wildgs.cli.train import read_scene, train_or_go_on
+from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.cli.webpage import write_scene_page
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
