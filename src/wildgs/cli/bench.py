@@ -43,6 +43,8 @@ from wildgs.version import __version__
 
 PROTOCOLS: tuple[Protocol, ...] = ("full", "half")
 MOST_NOTES = 12
+WIDTH_IN_FILES = 240
+"""Characters that the printed table may take where no terminal has to show it."""
 
 
 @dataclass(frozen=True)
@@ -254,4 +256,4 @@ def _print_table(rows: Sequence[Row]) -> None:
         table = Table(*section.header, title=section.title, title_justify="left")
         for line in section.lines:
             table.add_row(*line)
-        console.print(table)
+        console.print(table, width=None if console.is_terminal else WIDTH_IN_FILES)
