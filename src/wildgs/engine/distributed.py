@@ -170,6 +170,8 @@ def _peers() -> Iterator[None]:
     """
     try:
         yield
+    except torch.OutOfMemoryError:
+        raise
     except RuntimeError as error:
         reason = (str(error).splitlines() or [""])[0]
         message = (
@@ -198,12 +200,9 @@ def join() -> Iterator[Team]:
     if launch.world_size() == 1:
         yield Team()
         return
-    local = launch.local_rank()
-    _share_cores()
+    device = settle()
     try:
-        if torch.cuda.is_available():
-            _take_gpu(local)
-            device = torch.device("cuda", local)
+        if device.type == "cuda":
             dist.init_process_group("nccl", timeout=TIMEOUT, device_id=device)
         else:
             dist.init_process_group("gloo", timeout=TIMEOUT)
@@ -218,14 +217,24 @@ def join() -> Iterator[Team]:
         dist.destroy_process_group()
 
 
-def _take_gpu(local: int) -> None:
+def settle() -> torch.device:
+    """Gives this one of torchrun's processes its own GPU, or its part of the machine's cores.
+
+    Raises:
+        UserError: There are more processes than GPUs.
+    """
+    _share_cores()
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
     count = torch.cuda.device_count()
-    if local >= count:
+    if launch.local_rank() >= count:
         raise UserError(
             f"this machine has {count} GPUs for {launch.local_world_size()} processes; "
             f"use --nproc-per-node {count}"
         )
-    torch.cuda.set_device(local)
+    device = torch.device("cuda", launch.local_rank())
+    torch.cuda.set_device(device)
+    return device
 
 
 def _share_cores() -> None:
