@@ -24,7 +24,7 @@ from wildgs.engine.density import ScreenStatistics
 from wildgs.engine.team import DivergedRanksError, LostRankError, Team
 from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.losses.objective import Losses
-from wildgs.rasterize.cpu.threads import thread_count
+from wildgs.threads import thread_count
 
 Result = TypeVar("Result")
 
