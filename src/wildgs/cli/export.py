@@ -19,6 +19,9 @@ from wildgs.export.formats import SplatFormat, write_splats
 from wildgs.export.splats import Splats
 from wildgs.light.look import NEUTRAL, Look
 
+ExportFormat = Literal["html", "ply", "compressed.ply", "splat", "spz", "sog"]
+"""The page, and what `SplatFormat` lists."""
+
 COMPARED_VIEWS = 4
 PAGE_FILE = "page.html"
 
@@ -35,7 +38,7 @@ class Command:
 
     run: tyro.conf.Positional[Path]
     """Run folder."""
-    format: tuple[SplatFormat | Literal["html"], ...] = ("html",)
+    format: tuple[ExportFormat, ...] = ("html",)
     """One or several of html, ply, compressed.ply, splat, spz, sog."""
     appearance: tuple[str, ...] = ()
     """Photos of the scene by name, files of new photos or any pictures, saved appearances, or neutral. Without
