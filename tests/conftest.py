@@ -53,3 +53,35 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def shared() -> Path:
     """The folder with real photos and scenes; tests that use it carry the marker `shared`."""
     return SHARED
+
+
+TRAIN = (
+    "--steps",
+    40,
+    "--wrapping.resolution",
+    16,
+    "--parsing.max-side",
+    32,
+    "--parsing.encoder",
+    "nobody/none",
+)
+
+
+@pytest.fixture(scope="session")
+def landmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's landmark, tiny."""
+    from wildgs.data.synthetic import SyntheticConfig, make_landmark
+
+    folder = tmp_path_factory.mktemp("landmark") / "scene"
+    make_landmark(folder, SyntheticConfig(photos=9, test_every=4, long_side=48, points=1500, least_views=2))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained(landmark: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on the landmark, forty steps; tests must not change it."""
+    from wildgs.cli import main
+
+    output = tmp_path_factory.mktemp("runs") / "a run"
+    main([str(a) for a in ("train", landmark, "--output", output, *TRAIN)])
+    return output

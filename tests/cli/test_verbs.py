@@ -14,26 +14,6 @@ from PIL import Image
 
 from wildgs.cli import VERBS
 
-TRAIN = (
-    "--steps",
-    40,
-    "--wrapping.resolution",
-    16,
-    "--parsing.max-side",
-    32,
-    "--parsing.encoder",
-    "nobody/none",
-)
-
-
-@pytest.fixture(scope="session")
-def trained(landmark: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from wildgs.cli import main
-
-    output = tmp_path_factory.mktemp("runs") / "a run"
-    main([str(a) for a in ("train", landmark, "--output", output, *TRAIN)])
-    return output
-
 
 def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     """The one line on stderr."""
@@ -100,7 +80,7 @@ MISTAKES = {
     "nothing to resume": (("train", "{landmark}", "--output", "{tmp}/new", "--resume"), "config.yaml"),
     "unknown photo": (
         ("render", "{trained}", "--appearance", "x.jpg", "--output", "{tmp}/o"),
-        "no photo 'x.jpg'",
+        "neither a photo",
     ),
     "no photos": (("sfm", "{tmp}", "--output", "{tmp}/scene"), "no photo"),
     "bad downscale": (("train", "{landmark}", "--output", "{tmp}/run", "--downscale", "0"), "downscale"),

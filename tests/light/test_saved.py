@@ -82,5 +82,5 @@ def test_other_files_are_refused(method, look, tmp_path: Path, spoil, words) -> 
 
 
 def test_the_name_must_end_as_it_is_found_again(look, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="end in .safetensors"):
+    with pytest.raises(UserError, match=r"end in \.safetensors"):
         save_look(look, tmp_path / "evening.pt")

@@ -31,7 +31,7 @@ def test_between_two_looks_lies_their_mix(looks) -> None:
 
 def test_a_single_look_stays(looks) -> None:
     timeline = Timeline.of(looks[0])
-    assert {timeline.at(share) for share in (0, 0.3, 1)} == {looks[0]}
+    assert {timeline.at(share) for share in (0.0, 0.3, 1.0)} == {looks[0]}
 
 
 def test_the_light_moves_without_jumps(looks) -> None:

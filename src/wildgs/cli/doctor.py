@@ -68,6 +68,7 @@ def examine() -> list[Check]:
         ("depth weights", _depth_weights),
         ("LPIPS weights", _lpips),
         ("viewer", _viewer),
+        ("videos", _videos),
     ]
     checks = []
     for name, probe in probes:
@@ -212,6 +213,15 @@ def _viewer() -> Check:
     if importlib.util.find_spec("viser") is None:
         return Check("viewer", "missing", "`wildgs view` needs viser", _pip("viser"))
     return Check("viewer", "works", f"viser {importlib.metadata.version('viser')}")
+
+
+def _videos() -> Check:
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        detail = "`wildgs render` writes PNG frames only; videos need imageio-ffmpeg"
+        return Check("videos", "missing", detail, _pip("imageio-ffmpeg"))
+    import imageio_ffmpeg
+
+    return Check("videos", "works", f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}")
 
 
 def _pip(package: str, options: str = "") -> str:

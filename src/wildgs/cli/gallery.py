@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from PIL import Image
 
 from wildgs.api import LoadedScene, load
 from wildgs.cli.lights import LightOptions, find_looks
@@ -56,19 +57,30 @@ def run(command: Command) -> None:
     looks = find_looks(scene, command.light, specs)
     output = command.output or command.run / "gallery"
     tiles = render_tiles(scene, views, looks, output)
-    mixed = len(looks) != len(specs)
-    sources = [None if mixed else source_picture(scene.scene, spec) for spec in specs][: len(looks)]
-    rows: list[list[np.ndarray | None]] = [[None, *sources]] if any(s is not None for s in sources) else []
-    rows += [[view.read_photo().numpy(), *row] for view, row in zip(views, tiles, strict=True)]
-    longest = min(TILE, max(max(view.camera.width, view.camera.height) for view in views))
-    usual = views[0].camera
-    scale = longest / max(usual.width, usual.height)
-    tile = (round(usual.width * scale), round(usual.height * scale))
-    sheet = contact_sheet(rows, ["the view's photo", *(look.name for look in looks)], tile=tile)
+    # A mix of several photos has no photo to stand above it.
+    sources = [source_picture(scene.scene, spec) for spec in specs] if len(looks) == len(specs) else []
     aside = output / "gallery.jpg.part"
-    sheet.save(aside, format="JPEG", quality=QUALITY)
+    draw_sheet(views, looks, tiles, sources).save(aside, "JPEG", quality=QUALITY)
     aside.replace(output / "gallery.jpg")
     console.print(f"{len(views)} views x {len(looks)} appearances -> {output / 'gallery.jpg'}")
+
+
+def draw_sheet(
+    views: Sequence[View],
+    looks: Sequence[Look],
+    tiles: Sequence[Sequence[np.ndarray]],
+    sources: Sequence[np.ndarray | None],
+) -> Image.Image:
+    """The grid: below the photos that lend their light, beside those whose viewpoint is taken."""
+    rows: list[list[np.ndarray | None]] = []
+    if any(source is not None for source in sources):
+        rows.append([None, *sources])
+    for view, row in zip(views, tiles, strict=True):
+        rows.append([view.read_photo().numpy(), *row])
+    camera = views[0].camera
+    scale = min(1.0, TILE / max(camera.width, camera.height))
+    tile = (round(camera.width * scale), round(camera.height * scale))
+    return contact_sheet(rows, ["the view's photo", *(look.name for look in looks)], tile=tile)
 
 
 def some_views(scene: Scene) -> list[View]:

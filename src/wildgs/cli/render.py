@@ -66,8 +66,9 @@ def run(command: Command) -> None:
 
 def render_views(command: Command) -> None:
     """Every view under every appearance."""
-    if command.output.suffix or command.output.is_file():
-        check_output(command.output)
+    check_output(command.output)
+    if command.output.is_file():
+        raise UserError(f"{command.output}: is a file; give a folder for the pictures")
     scene = load(command.run)
     views = [find_view(scene.scene, name) for name in command.view] or list(scene.scene.test_views)
     if not views:
@@ -126,8 +127,8 @@ def find_cameras(scene: LoadedScene, command: Command) -> tuple[list[Camera], fl
         return cameras, command.fps or file_fps
     if not (fps > 0 and command.seconds > 0 and command.seconds * fps <= MAX_FRAMES):
         raise UserError(
-            f"{command.seconds:g} seconds at {fps:g} frames each: both must be above 0, and {MAX_FRAMES:,} frames"
-            " at most"
+            f"{command.seconds:g} seconds of {fps:g} frames: both must be above 0, and the video {MAX_FRAMES:,}"
+            " frames long at most"
         )
     frames = max(1, round(command.seconds * fps))
     return scene.path(kind, frames=frames, size=command.size, views=command.view), fps

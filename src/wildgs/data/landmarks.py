@@ -169,7 +169,8 @@ def _described_points(
     features = features * [camera.width / taken.width, camera.height / taken.height]
     reach = SAME_PLACE * max(camera.width, camera.height)
     positions = np.array([point.xy for point in observed])
-    distance, nearest = KDTree(positions).query(features, distance_upper_bound=max(reach, 1.0))
+    found = KDTree(positions).query(features, distance_upper_bound=max(reach, 1.0))
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     near = np.isfinite(distance)
     owners = np.array([rows[point.point3D_id] for point in observed], dtype=np.int64)
     return database.read_descriptors(stored.image_id).data[near], owners[nearest[near]]

@@ -25,8 +25,8 @@ from wildgs.data.undistort import PixelGrid, sample_colors
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 
-MIN_INLIERS = 20
-"""Fewer points that agree with a pose may do so by chance."""
+MIN_INLIERS = 15
+"""Fewer points that agree with a pose may do so by chance: photos of other places reach 5."""
 
 MATCH_RATIO = 0.85
 MAX_ERROR = 0.008
@@ -35,9 +35,11 @@ MAX_ERROR = 0.008
 REFINE_LENS = 60
 """Inliers from which the lens's distortion is estimated too."""
 
-FOCAL_RANGE = (0.35, 6.0)
-MAX_DISTORTION = 0.35
-"""What a photograph's lens may be, relative to the long side, and its radial term: beyond, the pose is wrong."""
+FOCAL_RANGE = (0.3, 30.0)
+"""Focal lengths of photographs, relative to the long side; a pose that needs another is wrong."""
+
+MAX_DISTORTION = 0.2
+"""Largest shift of a photo's corners by its lens, relative to their distance from the middle."""
 
 
 class LocalizationError(UserError):
@@ -100,7 +102,7 @@ def localize(
         matched, seen = match_landmarks(descriptors, landmarks, MATCH_RATIO)
     answer = _solve(features[matched], landmarks.points[seen], camera, known, seed)
     inliers = 0 if answer is None else int(answer["num_inliers"])
-    if answer is None or inliers < MIN_INLIERS or not _plausible(camera):
+    if answer is None or inliers < MIN_INLIERS:
         raise LocalizationError(
             f"{file}: could not be localised ({inliers} inliers of {len(matched)} matches with the scene's"
             f" points; at least {MIN_INLIERS} are needed)"
@@ -150,7 +152,10 @@ def _solve(
     known: bool,
     seed: int,
 ) -> dict[str, Any] | None:
-    """The pose; the camera's focal length, and with enough points its distortion, are refined in place."""
+    """The pose, None where there is none that a photograph could have.
+
+    The camera's focal length is refined in place, and with enough points its distortion.
+    """
     if len(pixels) < 4:
         return None
     estimation = pycolmap.AbsolutePoseEstimationOptions()
@@ -162,19 +167,24 @@ def _solve(
     refinement.refine_focal_length = True
     with quiet():
         answer = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, estimation, refinement)
-        if answer is not None and answer["num_inliers"] >= REFINE_LENS:
+        if answer is None or not _plausible(camera):
+            return None
+        if answer["num_inliers"] >= REFINE_LENS:
             refinement.refine_extra_params = True
-            pose = answer["cam_from_world"]
-            refined = pycolmap.refine_absolute_pose(
-                pose, pixels, points, answer["inlier_mask"], camera, refinement
-            )
-            answer["cam_from_world"] = pose if refined is None else refined["cam_from_world"]
+            bent = pycolmap.Camera(camera.todict())
+            pose, inliers = answer["cam_from_world"], answer["inlier_mask"]
+            refined = pycolmap.refine_absolute_pose(pose, pixels, points, inliers, bent, refinement)
+            if refined is not None and _plausible(bent):
+                answer["cam_from_world"] = refined["cam_from_world"]
+                camera.params = bent.params
     return answer
 
 
 def _plausible(camera: Any) -> bool:
-    focal, distortion = camera.params[0] / max(camera.width, camera.height), camera.params[3]
-    return FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1] and abs(distortion) <= MAX_DISTORTION
+    focal, radial = camera.params[0], camera.params[3]
+    corner = np.hypot(camera.width, camera.height) / 2 / focal
+    in_range = FOCAL_RANGE[0] <= focal / max(camera.width, camera.height) <= FOCAL_RANGE[1]
+    return bool(in_range and abs(radial) * corner**2 <= MAX_DISTORTION)
 
 
 def _as_view(

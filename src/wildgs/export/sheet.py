@@ -40,8 +40,9 @@ def contact_sheet(
         tile: Width and height of a place; pictures are fitted into it, not stretched.
     """
     width, height = tile
-    font = ImageFont.load_default(size=max(10, round(height * 0.075)))
-    above = round(1.6 * font.size)
+    letters = max(10, round(height * 0.075))
+    font = ImageFont.load_default(size=letters)
+    above = round(1.6 * letters)
     sheet = Image.new(
         "RGB",
         (len(captions) * (width + GAP) + GAP, above + len(rows) * (height + GAP) + GAP),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Generator, Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,8 +16,16 @@ from PIL import Image
 from wildgs.errors import UserError
 
 SUFFIXES = (".mp4", ".mkv", ".mov")
-CRF = 18
-"""x264's constant quality: 18 is hard to tell from the frames."""
+OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
+"""Endings by which someone asks for a file that is not written here, not for a folder."""
+
+ENCODING: dict[str, Any] = {
+    "codec": "libx264",
+    "quality": None,
+    "macro_block_size": 2,
+    "output_params": ["-crf", "18", "-movflags", "+faststart"],
+}
+"""H.264 that plays everywhere, at a quality that is hard to tell from the frames."""
 
 Frames = Iterable[UInt8[np.ndarray, "H W 3"]]
 
@@ -32,7 +41,7 @@ def check_output(path: Path) -> None:
     Raises:
         UserError: The name is of a video that cannot be written, or what a video needs is not installed.
     """
-    if path.suffix and not is_video(path):
+    if path.suffix.lower() in OTHER_MEDIA:
         known = ", ".join(SUFFIXES)
         raise UserError(f"{path}: videos end in {known}; a name without an ending makes a folder of PNGs")
     if is_video(path):
@@ -41,7 +50,7 @@ def check_output(path: Path) -> None:
         _ffmpeg()
 
 
-def _ffmpeg():
+def _ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError as error:
@@ -76,15 +85,7 @@ def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
         raise UserError(f"{size[0]} x {size[1]}: a video's width and height must be even numbers")
     with _aside(path) as folder:
         part = folder / path.name
-        writer = _ffmpeg().write_frames(
-            str(part),
-            size,
-            fps=fps,
-            codec="libx264",
-            quality=None,
-            macro_block_size=2,
-            output_params=["-crf", str(CRF), "-movflags", "+faststart"],
-        )
+        writer = _ffmpeg().write_frames(str(part), size, fps=fps, **ENCODING)
         try:
             writer.send(None)
             for frame in frames:
@@ -110,7 +111,7 @@ def _write_folder(path: Path, frames: Frames) -> None:
 
 
 @contextmanager
-def _aside(path: Path) -> Generator[Path]:
+def _aside(path: Path) -> Iterator[Path]:
     """A hidden folder on the same disk, gone afterwards whatever happens."""
     folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.part."))
     try:

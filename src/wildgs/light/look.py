@@ -63,9 +63,9 @@ def own_look(method: Method) -> Look:
 
 def mix(
     looks: Sequence[Look],
-    weights: Sequence[float],
+    weights: Sequence[float | int],
     *,
-    local_weights: Sequence[float] | None = None,
+    local_weights: Sequence[float | int] | None = None,
     name: str | None = None,
 ) -> Look:
     """Tuning: a look between others (paper, appendix Video Demo), at the cost of one shading, no encoding.
@@ -94,7 +94,7 @@ def mix(
     return Look(name, blend_embeddings(parts, weights, local), first.method)
 
 
-def _checked(looks: Sequence[Look], weights: Sequence[float]) -> list[float]:
+def _checked(looks: Sequence[Look], weights: Sequence[float | int]) -> list[float]:
     """The weights as they were given, but for rounding: scaled to add up to one exactly."""
     if len(weights) != len(looks):
         raise UserError(f"{len(looks)} appearances need {len(looks)} weights, not {len(weights)}")
@@ -104,8 +104,8 @@ def _checked(looks: Sequence[Look], weights: Sequence[float]) -> list[float]:
     return [float(weight) / total for weight in weights]
 
 
-def _describe(looks: Sequence[Look], weights: Sequence[float], local: Sequence[float]) -> str:
-    def sum_of(parts: Sequence[float]) -> str:
+def _describe(looks: Sequence[Look], weights: Sequence[float | int], local: Sequence[float | int]) -> str:
+    def sum_of(parts: Sequence[float | int]) -> str:
         return " + ".join(
             look.name if weight == 1 else f"{weight:.3g} {look.name}"
             for look, weight in zip(looks, parts, strict=True)

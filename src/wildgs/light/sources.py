@@ -31,7 +31,8 @@ AUTO = "auto"
 ONE_LIGHT = "the run is plain 3dgs, which has one light, its own, whatever photo is given"
 
 KEPT_LOOKS = 16
-"""Looks that are kept with their shaded harmonics, the last used."""
+KEPT_BYTES = 2_000_000_000
+"""Looks that are kept with their shaded harmonics, the last used: so many, and within so much memory."""
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and of how much."""
@@ -90,7 +91,8 @@ class LightSources:
         if key not in self._kept:
             self._kept[key] = self._make(self.method, str(spec), like, progress or _silent)
         self._kept.move_to_end(key)
-        while len(self._kept) > KEPT_LOOKS:
+        size = 4 * 3 * (self.method.sh_degree + 1) ** 2 * self.method.num_gaussians
+        while len(self._kept) > max(2, min(KEPT_LOOKS, KEPT_BYTES // max(size, 1))):
             self._kept.popitem(last=False)
         return self._kept[key]
 

@@ -1,0 +1,127 @@
+"""The Python API: the documented example runs as it stands; scenes are read only as far as needed."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import wildgs
+from wildgs.data import loading
+from wildgs.errors import UserError, WildGSWarning
+
+DOCS = Path(__file__).parents[1] / "docs" / "python.md"
+
+
+@pytest.fixture(scope="module")
+def scene(trained: Path) -> wildgs.LoadedScene:
+    return wildgs.load(trained)
+
+
+def test_the_documented_example_runs(trained: Path, tmp_path: Path, monkeypatch) -> None:
+    examples = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(examples) == 1
+    monkeypatch.chdir(tmp_path)
+    assert '"runs/gate"' in examples[0]
+    exec(compile(examples[0].replace('"runs/gate"', repr(str(trained))), str(DOCS), "exec"), {})
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        *(f"frame_{number:03d}.png" for number in range(5)),
+        "relit.png",
+    ]
+
+
+def test_importing_the_package_loads_no_torch() -> None:
+    code = "import sys, wildgs; wildgs.__version__; assert 'torch' not in sys.modules; assert 'load' in dir(wildgs)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = wildgs.nothing
+
+
+def test_render_is_the_methods_render(scene) -> None:
+    view = scene.views[0]
+    look = scene.appearance(view.name)
+    with torch.no_grad():
+        expected = scene.run.method.render(view.camera, look.sh).colors.clamp(0, 1) * 255
+    picture = scene.render(view.camera, look)
+    assert picture.shape == view.read_photo().shape
+    assert float((picture.float() - expected).abs().max()) <= 0.51
+
+
+def test_light_moves_colours_and_no_geometry(scene) -> None:
+    camera = scene.views[0].camera
+    first, second = (scene.appearance(view.name) for view in scene.views[:2])
+    assert not torch.equal(scene.render(camera, first), scene.render(camera, second))
+    renderings = [scene.run.method.render(camera, look.sh) for look in (first, second)]
+    assert torch.equal(renderings[0].depth, renderings[1].depth)
+    assert torch.equal(renderings[0].depth, scene.depth(camera))
+
+
+def test_photos_are_decoded_as_they_are_needed(trained: Path, monkeypatch) -> None:
+    decoded = []
+    load = loading.PhotoFiles.load
+    monkeypatch.setattr(
+        loading.PhotoFiles,
+        "load",
+        lambda files, **options: decoded.append(files.name) or load(files, **options),
+    )
+    scene = wildgs.load(trained)
+    names = [view.name for view in scene.views]
+    assert decoded == []
+    scene.appearance(names[3])
+    scene.views[3].read_photo()
+    assert decoded == [names[3]]
+
+
+def test_lazy_and_eager_scenes_are_the_same(trained: Path) -> None:
+    run = wildgs.load(trained).run
+    eager, lazy = run.load_scene(), run.load_scene(lazy=True)
+    assert [v.name for v in eager.views] == [v.name for v in lazy.views]
+    assert [v.split for v in eager.views] == [v.split for v in lazy.views]
+    assert torch.equal(eager.points, lazy.points)
+    for one, other in zip(eager.views, lazy.views, strict=True):
+        assert torch.equal(one.camera.viewmat, other.camera.viewmat)
+        assert torch.equal(one.read_photo(), other.read_photo())
+
+
+def test_frames_follow_cameras_and_lights(scene) -> None:
+    looks = [scene.appearance(view.name) for view in scene.views[:2]]
+    cameras = scene.path("orbit", frames=3, size=(24, 16))
+    frames = list(scene.frames(cameras, looks))
+    assert [frame.shape for frame in frames] == [(16, 24, 3)] * 3
+    assert torch.equal(frames[0], scene.render(cameras[0], looks[0]))
+    assert torch.equal(frames[2], scene.render(cameras[2], looks[1]))
+    middle = wildgs.mix(looks, [0.5, 0.5])
+    assert torch.equal(frames[1], scene.render(cameras[1], middle))
+
+
+def test_paths_are_of_the_photos_usual_size_unless_told(scene) -> None:
+    sizes = np.array([sorted((view.camera.width, view.camera.height)) for view in scene.views])
+    camera = scene.path("spiral", frames=2)[0]
+    assert (camera.height, camera.width) == tuple(np.median(sizes, axis=0) // 2 * 2)
+    with pytest.raises(UserError, match="at least one"):
+        scene.path("orbit", frames=0)
+
+
+def test_a_look_given_is_given_back(scene) -> None:
+    look = scene.appearance(scene.views[0].name)
+    assert scene.appearance(look) is look
+
+
+def test_plain_3dgs_has_its_own_light(landmark: Path, tmp_path: Path) -> None:
+    from wildgs.cli import main
+
+    main(["train", str(landmark), "--output", str(tmp_path / "run"), "--method", "3dgs", "--steps", "5"])
+    scene = wildgs.load(tmp_path / "run")
+    assert not scene.relightable
+    with pytest.warns(WildGSWarning, match="one light"):
+        look = scene.appearance(scene.views[0].name)
+    other = scene.appearance("neutral")
+    camera = scene.views[0].camera
+    mixed = wildgs.mix([look, other], [0.5, 0.5])
+    assert torch.equal(scene.render(camera, mixed), scene.render(camera, look))
