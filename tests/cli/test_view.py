@@ -15,15 +15,6 @@ TINY = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def run(landmark: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from wildgs.cli import main
-
-    output = tmp_path_factory.mktemp("runs") / "a run"
-    main([str(a) for a in ("train", landmark, "--output", output, *TINY)])
-    return output
-
-
 @pytest.fixture
 def left_open(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Viewers that were left open for people; Ctrl-C comes at once, when all work is done."""
@@ -47,19 +38,19 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-def test_view_opens_the_run_and_says_where(run: Path, wildgs, left_open: list[Any], capsys) -> None:
-    assert wildgs("view", run, "--port", 0) == 0
+def test_view_opens_the_run_and_says_where(trained: Path, wildgs, left_open: list[Any], capsys) -> None:
+    assert wildgs("view", trained, "--port", 0) == 0
     (viewer,) = left_open
     assert f"http://127.0.0.1:{viewer.server.get_port()}" in capsys.readouterr().out.replace("\n", "")
     assert len(viewer.display._handle.centers) == len(viewer.subject.method.gaussians)
-    assert viewer.recording.folder == run / "videos"
+    assert viewer.recording.folder == trained / "videos"
 
 
 def test_view_begins_with_the_lights_asked_for(
-    run: Path, landmark: Path, wildgs, left_open: list[Any]
+    trained: Path, landmark: Path, wildgs, left_open: list[Any]
 ) -> None:
     names = sorted(path.name for path in (landmark / "images").iterdir())
-    assert wildgs("view", run, "--port", 0, "--appearance", names[3], names[1]) == 0
+    assert wildgs("view", trained, "--port", 0, "--appearance", names[3], names[1]) == 0
     desk = left_open[0].lighting.desk
     assert (desk.first.spec, desk.second.spec) == (names[3], names[1])
 
@@ -84,20 +75,22 @@ def test_train_shows_itself_and_ends_as_ever(
     ],
 )
 def test_mistakes_are_one_line(
-    arguments: tuple[str, ...], message: str, run: Path, wildgs, tmp_path: Path, capsys
+    arguments: tuple[str, ...], message: str, trained: Path, wildgs, tmp_path: Path, capsys
 ) -> None:
     capsys.readouterr()
-    assert wildgs(*(a.format(tmp=tmp_path, run=run) for a in arguments)) == 2
+    assert wildgs(*(a.format(tmp=tmp_path, run=trained) for a in arguments)) == 2
     assert message in complaint(capsys)
 
 
 @pytest.mark.parametrize("verb", ["view", "train"])
 def test_without_viser_it_says_how_to_get_it(
-    verb: str, run: Path, landmark: Path, wildgs, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+    verb: str, trained: Path, landmark: Path, wildgs, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     capsys.readouterr()
-    arguments = ("view", run) if verb == "view" else ("train", landmark, "--output", tmp_path / "r", "--view")
+    arguments = (
+        ("view", trained) if verb == "view" else ("train", landmark, "--output", tmp_path / "r", "--view")
+    )
     assert wildgs(*arguments) == 2
     assert "pip install 'wildgs[viewer]'" in complaint(capsys)
     assert not (tmp_path / "r").exists()
