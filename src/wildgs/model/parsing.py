@@ -15,6 +15,7 @@ from wildgs.model.precision import MixedModule
 from wildgs.model.unet import UpBlock, standardize_output
 
 CALIBRATION_SIDE = 224
+SIDE_STEP = 32
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
 
@@ -111,14 +112,22 @@ class Parsing(MixedModule):
             standardize_output(last, self.global_mlp(pooled))
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
-        """The photo as a batch of one, at most `max_side` long."""
+        """The photo as a batch of one, at most `max_side` long, its sides multiples of `SIDE_STEP`.
+
+        Photos of all sizes and shapes then come in a few: libraries prepare, and on CPUs compile, a convolution
+        for every new size, which took longer than computing it. Proportions change a little; the mask is carried
+        back to the photo's own.
+        """
         image = photo.permute(2, 0, 1)[None]
-        height, width = photo.shape[:2]
-        factor = self.config.max_side / max(height, width)
-        if factor >= 1:
+        factor = min(1.0, self.config.max_side / max(photo.shape[:2]))
+        most = max(SIDE_STEP, self.config.max_side // SIDE_STEP * SIDE_STEP)
+        height, width = (
+            min(most, max(SIDE_STEP, round(side * factor / SIDE_STEP) * SIDE_STEP))
+            for side in photo.shape[:2]
+        )
+        if (height, width) == tuple(photo.shape[:2]):
             return image
-        size = (max(1, round(height * factor)), max(1, round(width * factor)))
-        return functional.interpolate(image, size=size, mode="bilinear", antialias=True)
+        return functional.interpolate(image, size=(height, width), mode="bilinear", antialias=True)
 
 
 def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"]) -> None:
