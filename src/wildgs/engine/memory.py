@@ -2,8 +2,8 @@
 
 `benchmarks/memory.py` measures the constants: peak resident memory of short trainings that differ in one size. For
 `3dgs` on the CPU it gave 2,095 bytes a Gaussian and 262 bytes a pixel, rounded up here; those of `wildgs` are
-reckoned from the sizes of its tensors. They hold for what a step needs beside the decoded photos, which have a limit
-of their own.
+reckoned from the sizes of its tensors. They hold for what a step needs beside the decoded photos, which have a
+limit of their own.
 """
 
 from __future__ import annotations
