@@ -24,7 +24,7 @@ from wildgs.cli.bench_plan import (
 )
 from wildgs.cli.eval import evaluate_run
 from wildgs.cli.progress import console
-from wildgs.cli.training import read_scene, train_to_end
+from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.engine.checkpoint import list_checkpoints
@@ -38,7 +38,7 @@ from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
 from wildgs.model.wildgs import WildGSConfig
-from wildgs.runs import CHECKPOINT_FOLDER, load_run, resume_training, start_training
+from wildgs.runs import CHECKPOINT_FOLDER, load_run
 from wildgs.version import __version__
 
 PROTOCOLS: tuple[Protocol, ...] = ("full", "half")
@@ -219,12 +219,7 @@ class _Bench:
 
 def train_job(job: Job, scene: Scene) -> None:
     """Trains a run from where it stands to its end."""
-    if list_checkpoints(job.folder / CHECKPOINT_FOLDER):
-        trainer = resume_training(job.folder, scene)
-    else:
-        trainer = start_training(job.folder, job.config, scene)
-    if trainer.step < job.config.train.steps:
-        train_to_end(job.folder, job.config, scene, trainer)
+    train_or_go_on(job.folder, job.config, scene)
 
 
 def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:

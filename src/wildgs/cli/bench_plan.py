@@ -213,6 +213,7 @@ def _check_stored(job: Job) -> None:
     if not file.is_file():
         return
     differing = differing_entries(read_config(file), job.config)
+    differing.pop("data.image_cache", None)  # it has no influence on the result
     budget = differing.get("train.density.max_gaussians")
     if budget is not None and budget[0] < budget[1]:  # lowered where memory was short
         del differing["train.density.max_gaussians"]

@@ -12,13 +12,12 @@ import torch
 from wildgs.api import LoadedScene
 from wildgs.cli.lights import find_look
 from wildgs.cli.showcase import different_lights
-from wildgs.data import View
+from wildgs.data import View, match_view
 from wildgs.export.cleanup import CleanupConfig, kept_rows
 from wildgs.export.page import Page, PageLight, PageView, write_page
 from wildgs.export.splats import Splats
 from wildgs.export.start_view import choose_start
 from wildgs.light.look import NEUTRAL, Look
-from wildgs.light.photos import match_view
 from wildgs.model.gaussians import NEAR
 from wildgs.runs import Run
 

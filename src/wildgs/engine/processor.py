@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import sys
 
 import torch
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
-_PRIMITIVES = 8192
 _MMAP_BYTES, _KEPT_BYTES = 2**25, 2**30  # glibc takes no more than 32 MiB for the first
 
 
@@ -19,8 +17,6 @@ def settle_on_cpu() -> None:
     Denormal numbers become zero: Adam's moments of what gets no gradient decay into them, and processors take up to
     100 times as long over each. And memory that a step frees is kept for the next one: handing every large tensor
     back to the system costs a page fault per 4 KiB, step after step (glibc's malloc alone; others keep it anyway).
-    And oneDNN keeps what it compiled for every size of convolution and matrix product: its own limit of 1,024 is
-    passed by a collection of photos of many sizes, and most of a step went into compiling again.
     """
     torch.set_flush_denormal(True)
     os.environ.setdefault(

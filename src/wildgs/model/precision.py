@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import AbstractContextManager
 from typing import Literal
 
@@ -9,6 +10,10 @@ import torch
 from torch import nn
 
 Precision = Literal["auto", "float32", "bfloat16"]
+
+# oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024 by itself. A collection of
+# photos of many sizes needs more, and two thirds of every step went into compiling again. Read at the first of them.
+os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 
 
 class MixedModule(nn.Module):
