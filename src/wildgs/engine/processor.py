@@ -19,9 +19,6 @@ def settle_on_cpu() -> None:
     back to the system costs a page fault per 4 KiB, step after step (glibc's malloc alone; others keep it anyway).
     """
     torch.set_flush_denormal(True)
-    os.environ.setdefault(
-        "ONEDNN_PRIMITIVE_CACHE_CAPACITY", str(_PRIMITIVES)
-    )  # read at the first convolution
     if sys.platform == "linux":
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
         if mallopt is not None:

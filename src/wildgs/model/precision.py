@@ -11,8 +11,8 @@ from torch import nn
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
-# oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024 by itself. A collection of
-# photos of many sizes needs more, and two thirds of every step went into compiling again. Read at the first of them.
+# oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024 by itself. A collection
+# of photos of many sizes needs more: two thirds of every step went into compiling again. Read at the first of them.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 
 
