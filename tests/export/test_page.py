@@ -53,7 +53,7 @@ def test_hostile_names_stay_text(page: Page, tmp_path: Path) -> None:
     write_page(page, file)
     elements = Elements(file)
     assert [tag for tag, _ in elements.found].count("script") == 4
-    assert elements.texts["h1"].strip() == elements.texts["title"] == HOSTILE
+    assert elements.texts["h1"].strip() == elements.texts["title"].strip() == HOSTILE
     header = json.loads(elements.texts["header"])
     assert [light["name"] for light in header["lights"]] == [HOSTILE, "evening.jpg"]
     assert [path.name for path in file.parent.iterdir()] == ["page.html"]

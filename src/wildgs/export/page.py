@@ -103,14 +103,14 @@ def write_page(
         ValueError: The page has no light or no Gaussian.
     """
     own = page.splats.sh_degree
-    text = ""
+    content = b""
     for degree in range(own, -1, -1) if sh_degree is None else [min(sh_degree, own)]:
-        text = _compose(page, _pack(page, degree, viewpoints))
-        if len(text) <= BUDGET_BYTES:
+        content = _compose(page, _pack(page, degree, viewpoints)).encode()
+        if len(content) <= BUDGET_BYTES:
             break
     file.parent.mkdir(parents=True, exist_ok=True)
     aside = file.with_name(f".{file.name}.part")
-    aside.write_text(text, encoding="utf-8")
+    aside.write_bytes(content)
     aside.replace(file)
     return degree
 
