@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -200,6 +201,8 @@ def join() -> Iterator[Team]:
     if launch.world_size() == 1:
         yield Team()
         return
+    # A library's handler would print a page of stack where torchrun ends those that are left.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     device = settle()
     try:
         if device.type == "cuda":
