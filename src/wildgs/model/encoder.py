@@ -48,7 +48,8 @@ class FrozenBatchNorm(nn.Module):
         """Scaled and shifted features."""
         if self.calibrating:
             self.running_mean.copy_(x.mean(dim=(0, 2, 3)))
-            self.running_var.copy_(x.var(dim=(0, 2, 3)))
+            # A single value (one small photo, deepest level) has no unbiased variance.
+            self.running_var.copy_(x.var(dim=(0, 2, 3), correction=min(1, x[:, 0].numel() - 1)))
         scale = self.weight * (self.running_var + self.eps).rsqrt()
         shift = self.bias - self.running_mean * scale
         return torch.addcmul(shift.to(x.dtype)[:, None, None], x, scale.to(x.dtype)[:, None, None])
