@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -123,10 +124,11 @@ class Ranks(Team):
             dist.all_reduce(message, op=dist.ReduceOp.MAX, group=self._control)
         self._verdict, most, least, *present = message.tolist()
         if most != -least:
-            raise DivergedRanksError(
+            message = (
                 f"the ranks' models differ in size ({-least:,} and {most:,} numbers); --resume goes on from the "
                 "newest checkpoint, which all ranks take from rank 0"
             )
+            raise DivergedRanksError(message) if self.first else ReportedError(message)
         for parameter, somewhere in zip(parameters, present, strict=True):
             if somewhere and parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
@@ -200,6 +202,8 @@ def join() -> Iterator[Team]:
     if launch.world_size() == 1:
         yield Team()
         return
+    # A library's handler would print a page of stack where torchrun ends those that are left.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     device = settle()
     try:
         if device.type == "cuda":
@@ -211,10 +215,18 @@ def join() -> Iterator[Team]:
         reason = (str(error).splitlines() or [""])[0]
         raise UserError(f"the processes find no connection to each other: {reason}") from error
     assert isinstance(control, dist.ProcessGroup)
-    yield Ranks(control)
-    # Not after an error: it would wait for ranks that are gone.
-    with contextlib.suppress(RuntimeError):
-        dist.destroy_process_group()
+    agreed = False
+    try:
+        yield Ranks(control)
+        agreed = True
+    except KeyboardInterrupt:
+        agreed = True
+        raise
+    finally:
+        # After an error nccl would wait for ranks that are gone.
+        if agreed or device.type == "cpu":
+            with contextlib.suppress(RuntimeError):
+                dist.destroy_process_group()
 
 
 def settle() -> torch.device:
