@@ -48,7 +48,4 @@ const packed = gzipSync(result.outputFiles[0].contents, { level: 9 });
 packed.fill(0, 4, 8);
 packed[9] = 255;
 await writeFile(join(target, "viewer.js.gz"), packed);
-for (const file of ["page.html", "style.css"]) {
-  await writeFile(join(target, file), await readFile(join(here, "src", file)));
-}
 console.log(`viewer.js.gz: ${(packed.length / 1e6).toFixed(2)} MB, of ${[...found].join(", ")}`);

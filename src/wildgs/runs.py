@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import torch
 
 from wildgs.config import RunConfig, read_config, to_plain, write_config
 from wildgs.data import Alignment, Scene, load_scene
+from wildgs.data.depth_points import depth_points
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
@@ -109,7 +110,7 @@ def lock_run(folder: Path) -> Iterator[None]:
         raise UserError(
             f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
         ) from error
-    except NotImplementedError:  # a network disk without locks: better unlocked than not at all
+    except NotImplementedError:  # what filelock raises on disks without locks: training there goes unlocked
         yield
         return
     except OSError as error:
@@ -175,7 +176,8 @@ def start_training(
     with team.together():
         torch.manual_seed(config.train.seed)
         points, colors = _within_budget(scene, config)
-        method = create_method(config.method, config.model, points, colors)
+        dense = _dense_points(scene, config, len(points)) if config.method == "wildgs" else None
+        method = create_method(config.method, config.model, points, colors, dense)
         return Trainer(method.to(device or default_device()), scene, config.train, team)
 
 
@@ -183,6 +185,13 @@ def _claim(folder: Path, config: RunConfig) -> None:
     refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
+
+
+def _dense_points(scene: Scene, config: RunConfig, sparse: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points from depth priors, no more than half of what the budget leaves for growth."""
+    room = max(0, config.train.density.max_gaussians - sparse - config.model.sky.points) // 2
+    wanted = config.model.depth_points
+    return depth_points(scene, replace(wanted, points=min(wanted.points, room)), config.train.seed)
 
 
 def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:

@@ -162,7 +162,7 @@ def test_phototourism_as_distributed_beside_the_papers_figures(
         (("{landmark}", "--seed", 3), "--seeds"),
         (("{landmark}", "--variant", "a:model.fusion.hiden=3"), "unknown entry 'hiden'"),
         (("{tmp}/nowhere",), "nowhere: no such folder"),
-        (("{landmark}", "--steps", 0), "--steps 0"),
+        (("{landmark}", "--steps", 0), "steps 0: must be 1 or more"),
     ],
 )
 def test_mistakes_are_one_line(

@@ -114,7 +114,8 @@ def test_a_budget_lowered_for_memory_is_no_other_setting(landmark, tmp_path):
     density = replace(BASE.train.density, max_gaussians=1000)
     lowered = replace(job.config, train=replace(job.config.train, density=density))
     write_config(job.folder / "config.yaml", lowered)
-    make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
+    (again,) = make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
+    assert again.folder == job.folder
 
 
 def test_preset_finds_its_scenes_in_the_papers_order(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from wildgs.cli import train as train_verb
+from wildgs.cli import training
 from wildgs.cli.interrupts import InterruptedTrainingError, StopOnSignal
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.engine.trainer import Trainer
@@ -225,8 +225,8 @@ def test_an_interrupted_demo_goes_on(landmark: Path, tmp_path: Path) -> None:
 
     config = RunConfig(landmark, "3dgs", train=TrainConfig(steps=4))
     scene = load_scene(landmark)
-    train_verb.train_or_go_on(tmp_path, config, scene)
-    train_verb.train_or_go_on(tmp_path, config, scene)
+    training.train_or_go_on(tmp_path, config, scene)
+    training.train_or_go_on(tmp_path, config, scene)
     assert read_config(tmp_path / "config.yaml").train.steps == 4
     with pytest.raises(UserError, match="other settings"):
-        train_verb.train_or_go_on(tmp_path, replace(config, train=TrainConfig(steps=5)), scene)
+        training.train_or_go_on(tmp_path, replace(config, train=TrainConfig(steps=5)), scene)

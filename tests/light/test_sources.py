@@ -102,7 +102,7 @@ def test_a_picture_that_cannot_be_localised_says_so_and_is_used(sources, picture
 
 def test_with_like_nothing_is_localised(sources, picture, monkeypatch) -> None:
     monkeypatch.setattr(module, "load_landmarks", lambda *_: pytest.fail("localised"))
-    sources.find(picture, like="0.jpg")
+    assert "0.jpg" in sources.find(picture, like="0.jpg").note
 
 
 def test_a_new_photo_of_the_place_is_encoded_from_its_camera(

@@ -86,6 +86,19 @@ def test_calibration_tells_photos_apart() -> None:
     assert float(before.std(dim=0).max()) < 0.1
 
 
+@pytest.mark.parametrize("statistics", [True, False])
+def test_a_colour_cast_moves_the_embedding_as_brightness_does(statistics: bool) -> None:
+    torch.manual_seed(0)
+    parsing = Parsing(ParsingConfig(max_side=64, color_statistics=statistics), load_encoder(None))
+    photos = [torch.rand(64, 64, 3) * brightness for brightness in (0.2, 0.4, 0.6, 0.8, 1.0)]
+    green = torch.tensor([0.97, 1.03, 0.97])
+    parsing.calibrate([photos[0] * green, *photos[1:3], photos[3] * green, photos[4]])
+    with torch.no_grad():
+        brighter = float((parsing(photos[3])[1] - parsing(photos[2])[1]).norm())
+        greener = float((parsing(photos[2] * green)[1] - parsing(photos[2])[1]).norm())
+    assert (greener > 0.3 * brighter) == statistics
+
+
 def test_calibration_on_equal_photos_stays_finite() -> None:
     parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
     photo = torch.full((64, 64, 3), 0.5)

@@ -121,8 +121,10 @@ def test_parameters_that_are_no_numbers_do_not_crash_the_rasteriser() -> None:
             made.gaussians.rows[row][:7] = value
             made.gaussians.rows[row][7:9, 0] = float("nan")
             sh = made.shade(made.encode(edge.views[0].read_photo().float(), camera))
-            made.render(camera, sh)
+            rendering = made.render(camera, sh)
             made.gaussians.rows[row].copy_(before)
+        assert rendering.colors.shape == (camera.height, camera.width, 3)
+        assert bool(torch.isfinite(rendering.alpha).all()), row
 
 
 @pytest.mark.parametrize("count", [1, 2])

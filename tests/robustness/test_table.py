@@ -103,11 +103,16 @@ def spoil_picture(path: Path, fault: str, channels: int) -> None:
         path.write_bytes(huge_png())
 
 
+def rename_photo(root: Path, model) -> None:
+    """To a name of blanks, letters of many alphabets and a byte that is no UTF-8; the model is not written."""
+    model.names[2] = "Fotos ü 写真/p\udcff 2.png".encode(errors="surrogateescape")
+    spoil_picture(root / "images" / os.fsdecode(model.names[2]), "names", 3)
+
+
 def spoil_photo(root: Path, fault: str, model) -> None:
     if fault == "names":
-        model.names[2] = "Fotos ü 写真/p\udcff 2.png".encode(errors="surrogateescape")
+        rename_photo(root, model)
         model.write_binary(root / "sparse/0")
-        spoil_picture(root / "images" / os.fsdecode(model.names[2]), fault, 3)
     elif fault == "duplicate":
         first, second = root / "images/p01.png", root / "images" / PHOTO
         second.write_bytes(first.read_bytes())
@@ -139,7 +144,7 @@ def spoil_model(root: Path, fault: str, model, ending: str) -> None:
             path = folder / "points3D.bin"
             path.write_bytes(struct.pack("<Q", 2**61) + path.read_bytes()[8:])
     elif fault == "names":
-        spoil_photo(root, fault, model)
+        rename_photo(root, model)
         write(folder)
     elif fault not in changes:
         spoil_file(folder / f"images.{ending}", fault)

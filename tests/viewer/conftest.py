@@ -10,6 +10,7 @@ import subprocess
 import threading
 import time
 import urllib.request
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import torch
 
 from wildgs.data import Alignment, Scene, View
 from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.errors import WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import create_method
@@ -72,7 +74,9 @@ def make_trainer(scene: Scene, steps: int, method="wildgs") -> Trainer:
         wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)),
     )
     torch.manual_seed(0)
-    made = create_method(method, model, scene.points, scene.point_colors)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", WildGSWarning)  # of weights that tests do without
+        made = create_method(method, model, scene.points, scene.point_colors)
     return Trainer(made, scene, TrainConfig(steps=steps, precision="float32"))
 
 

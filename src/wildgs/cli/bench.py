@@ -107,8 +107,6 @@ def _plan(command: Command) -> list[Job]:
         raise UserError("--seed: a bench takes its seeds from --seeds")
     if not command.scenes or not command.seeds or not (command.methods or command.variant):
         raise UserError("a bench needs at least one scene, one of --methods or --variant, and one of --seeds")
-    if command.train.steps < 1:
-        raise UserError(f"--steps {command.train.steps}: must be 1 or more")
     base = RunConfig(Path(), "wildgs", command.data, command.model, command.train)
     scenes: Sequence[Path] = command.scenes
     if command.preset == "phototourism":

@@ -156,7 +156,7 @@ class DensityControl:
         splits = grows & ~clones
         prune = gaussians.opacities < self.config.prune_opacity
         if prune_large:
-            distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=-1)
+            distance = (gaussians.means - gaussians.means.nanmedian(dim=0).values).norm(dim=-1)
             prune = prune | (largest > self.config.prune_scale * distance.clamp_min(self.extent))
             prune = prune | (self.reach.to(prune.device) > self.config.prune_reach)
         finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)

@@ -47,9 +47,12 @@ class FrozenBatchNorm(nn.Module):
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
         """Scaled and shifted features."""
         if self.calibrating:
-            self.running_mean.copy_(x.mean(dim=(0, 2, 3)))
+            mean = x.mean(dim=(0, 2, 3))
             # A single value (one small photo, deepest level) has no unbiased variance.
-            self.running_var.copy_(x.var(dim=(0, 2, 3), correction=min(1, x[:, 0].numel() - 1)))
+            var = x.var(dim=(0, 2, 3), correction=min(1, x[:, 0].numel() - 1))
+            self.running_mean.copy_(mean)
+            # What hardly varies (blank photos) is not blown up: every other photo would then be far off.
+            self.running_var.copy_(var.where(var > 1e-4 * (1 + mean.square()), 1.0))
         scale = self.weight * (self.running_var + self.eps).rsqrt()
         shift = self.bias - self.running_mean * scale
         return torch.addcmul(shift.to(x.dtype)[:, None, None], x, scale.to(x.dtype)[:, None, None])

@@ -21,12 +21,15 @@ class FusionConfig:
         hidden: Width of the two hidden layers.
         sh_degree: Degree of the predicted spherical harmonics.
         output_scale: Factor on the output layer's initial weights.
+        color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
+            exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
     """
 
     intrinsic_size: int = 32
     hidden: int = 64
     sh_degree: int = 3
     output_scale: float = 0.1
+    color_transform: bool = True
 
 
 class Fusion(MixedModule):
@@ -34,7 +37,8 @@ class Fusion(MixedModule):
 
     A linear path from the intrinsic feature to the output runs beside the hidden layers. At the start it copies
     the feature's first three entries to the flat part of the harmonics; `initial_intrinsic` puts the SfM point's
-    colour there, and the hidden layers add little, so training begins near the point cloud's colours.
+    colour there, and the hidden layers add little, so training begins near the point cloud's colours. What comes
+    out is mapped by the photo's colour transform, which begins as the identity.
     """
 
     def __init__(self, config: FusionConfig, global_size: int, local_size: int) -> None:
@@ -52,6 +56,10 @@ class Fusion(MixedModule):
             self.output.bias.zero_()
             self.direct.weight.zero_()
             self.direct.weight[:3, :3] = torch.eye(3)
+        self.transform = nn.Linear(global_size, 12) if config.color_transform else None
+        if self.transform is not None:
+            nn.init.zeros_(self.transform.weight)
+            nn.init.zeros_(self.transform.bias)
 
     def initial_intrinsic(self, colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P I"]:
         """Intrinsic features with which the colours come out flat: their SH constants, then small noise."""
@@ -75,4 +83,14 @@ class Fusion(MixedModule):
             hidden = self.second(hidden).relu()
             fused = self.output(hidden)
         # The direct path carries the base colour and stays in full precision.
-        return (fused.float() + self.direct(intrinsic)).reshape(-1, self.coefficients, 3)
+        sh = (fused.float() + self.direct(intrinsic)).reshape(-1, self.coefficients, 3)
+        return sh if self.transform is None else _transformed(sh, self.transform(global_embedding))
+
+
+def _transformed(sh: Float[Tensor, "N K 3"], change: Float[Tensor, " 12"]) -> Float[Tensor, "N K 3"]:
+    """Harmonics of the colours ``c + A c + b``, with A (row by row) and b in `change`."""
+    matrix, offset = torch.eye(3).to(change) + change[:9].reshape(3, 3), change[9:]
+    grey = torch.full_like(offset, 0.5)
+    sh = sh @ matrix.T
+    flat = sh[:, :1] + rgb_to_sh0(matrix @ grey + offset)
+    return torch.cat([flat, sh[:, 1:]], dim=1)

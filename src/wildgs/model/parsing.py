@@ -12,10 +12,14 @@ from torch.nn import functional
 
 from wildgs.model.encoder import FEATURE_WIDTHS, RESNET18, Encoder, load_encoder
 from wildgs.model.precision import MixedModule
-from wildgs.model.unet import UpBlock, standardize_output
+from wildgs.model.unet import LEAST_SPREAD, UpBlock, standardize_output
 
 CALIBRATION_SIDE = 224
 SIDE_STEP = 32
+OPPONENTS = ((1 / 3, 1 / 3, 1 / 3), (0.5, -0.5, 0.0), (-0.25, -0.25, 0.5))
+"""Brightness, red against green, blue against yellow: so that a colour cast is not lost beside brightness."""
+
+STATISTICS = 2 * len(OPPONENTS)
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
 
@@ -28,12 +32,15 @@ class ParsingConfig:
         encoder: ResNet-18's folder or hub name.
         max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
             anyway, and cost grows with the square.
+        color_statistics: Whether M^G also reads mean and spread of the photo's own colours. Not in the paper; but
+            what five stages leave of a photo says little of its colour cast.
         global_size: Length of the global embedding (paper: 16).
         decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
     """
 
     encoder: str = RESNET18
     max_side: int = 256
+    color_statistics: bool = True
     global_size: int = 16
     decoder_widths: tuple[int, int, int] = (128, 64, 32)
 
@@ -52,8 +59,9 @@ class Parsing(MixedModule):
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
         deep = FEATURE_WIDTHS[-1]
+        summary = deep + (STATISTICS if config.color_statistics else 0)
         self.global_mlp = nn.Sequential(
-            nn.Linear(deep, 64), nn.LeakyReLU(0.1), nn.Linear(64, config.global_size)
+            nn.Linear(summary, 64), nn.LeakyReLU(0.1), nn.Linear(64, config.global_size)
         )
         widths = (deep, *config.decoder_widths)
         self.decoder = nn.ModuleList(
@@ -76,17 +84,27 @@ class Parsing(MixedModule):
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
         with self.mixed(photo.device):
+            image = self.shrink(photo)
             with torch.set_grad_enabled(learn_encoder and torch.is_grad_enabled()):
-                features = self.encoder(self.shrink(photo))
+                features = self.encoder(image)
             x = features[-1]
             for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
                 x = block(x, skip)
             coarse = self.mask_head(x)
-        embedding = self.global_mlp(features[-1].float().mean(dim=(2, 3)))[0]
+        embedding = self.global_mlp(self._summary(image, features[-1]))[0]
         logits = functional.interpolate(
             coarse.float(), size=photo.shape[:2], mode="bilinear", align_corners=False
         )
         return logits[0, 0].sigmoid(), embedding
+
+    def _summary(self, images: Float[Tensor, "B 3 H W"], deepest: Tensor) -> Float[Tensor, "B S"]:
+        """What M^G reads: the average of the deepest features and, where configured, the colour statistics."""
+        pooled = deepest.float().mean(dim=(2, 3))
+        if not self.config.color_statistics:
+            return pooled
+        opponents = torch.einsum("oc, bchw -> bohw", torch.tensor(OPPONENTS).to(images), images)
+        spread, mean = torch.std_mean(opponents.float(), dim=(2, 3), correction=0)
+        return torch.cat([pooled, mean, spread], dim=1)
 
     @torch.no_grad()
     def calibrate(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
@@ -107,9 +125,14 @@ class Parsing(MixedModule):
         self.encoder.calibrate(squares)
         if len(photos) > 1:
             first, last = self.global_mlp[0], self.global_mlp[-1]
-            pooled = self.encoder(squares)[-1].mean(dim=(2, 3))
-            _standardize_input(first, pooled)
-            standardize_output(last, self.global_mlp(pooled))
+            summary = self._summary(squares, self.encoder(squares)[-1])
+            deep = FEATURE_WIDTHS[-1]
+            _standardize_input(first, summary, slice(0, deep))
+            for each in range(deep, summary.shape[1]):
+                # These few are to tell as much as the many features: all enter with one variance.
+                first.weight[:, each].mul_((deep / STATISTICS) ** 0.5)
+                _standardize_input(first, summary, slice(each, each + 1))
+            standardize_output(last, self.global_mlp(summary))
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
         """The photo as a batch of one, at most `max_side` long, its sides multiples of `SIDE_STEP`.
@@ -130,13 +153,17 @@ class Parsing(MixedModule):
         return functional.interpolate(image, size=(height, width), mode="bilinear", antialias=True)
 
 
-def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"]) -> None:
+def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"], part: slice) -> None:
     """Makes a layer do with samples as they are what it would do with them around 0 and with spread 1 on average.
 
-    One factor for all features: what differs little between photos is mostly noise, and equal spread for every
-    feature would let the layer learn single photos by heart.
+    Of the inputs only `part` is touched. One factor for all of it: what differs little between photos is mostly
+    noise, and equal spread for every feature would let the layer learn single photos by heart. Photos that are
+    all alike leave it as it is.
     """
+    samples = samples[:, part]
     mean = samples.mean(dim=0)
     spread = (samples - mean).square().mean().sqrt()
-    layer.weight.div_(spread.clamp_min(0.01 * float(samples.abs().mean()) + 1e-8))
-    layer.bias.sub_(layer.weight @ mean)
+    if spread < LEAST_SPREAD:
+        return
+    layer.weight[:, part].div_(spread.clamp_min(0.01 * float(samples.abs().mean())))
+    layer.bias.sub_(layer.weight[:, part] @ mean)

@@ -25,6 +25,7 @@ def create_method(
     config: WildGSConfig,
     points: Float[Tensor, "P 3"],
     colors: UInt8[Tensor, "P 3"],
+    dense: tuple[Float[Tensor, "D 3"], UInt8[Tensor, "D 3"]] | None = None,
 ) -> Method:
     """A method at its start.
 
@@ -33,10 +34,11 @@ def create_method(
         config: Used by `wildgs` alone.
         points: Sparse SfM points in the scene's aligned frame.
         colors: Their colours.
+        dense: Further points with colours that `wildgs` alone starts from.
     """
     if name == "3dgs":
         return VanillaGS.from_points(points, colors)
-    return WildGS.from_points(config, points, colors)
+    return WildGS.from_points(config, points, colors, dense=dense)
 
 
 def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tensor]) -> Method:

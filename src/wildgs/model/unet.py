@@ -77,10 +77,11 @@ class UNet(nn.Module):
 
 @torch.no_grad()
 def standardize_output(layer: nn.Linear, samples: Float[Tensor, "B O"]) -> None:
-    """Gives a layer's outputs, of which `samples` are examples, mean 0 and spread 1 each.
+    """Gives a layer's outputs, of which `samples` are examples, mean 0 and spread 1 each, where they spread at all.
 
     A start that suits the data, as Mishkin and Matas 2016 ('All you need is a good init') give it to every layer.
     """
-    spread = samples.std(dim=0).clamp_min(LEAST_SPREAD)
+    spread = samples.std(dim=0)
+    spread = spread.where(spread > LEAST_SPREAD, 1.0)
     layer.weight.div_(spread[:, None])
     layer.bias.sub_(samples.mean(dim=0)).div_(spread)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from wildgs.data.depth_points import DepthPointsConfig
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.encoder import Encoder
@@ -38,6 +39,7 @@ class WildGSConfig:
         parsing: 2D Parsing.
         wrapping: 3D Wrapping.
         fusion: The fusion network.
+        depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.
         sky: Gaussians that stand for the sky at the start.
     """
 
@@ -46,6 +48,7 @@ class WildGSConfig:
     parsing: ParsingConfig = field(default_factory=ParsingConfig)
     wrapping: WrappingConfig = field(default_factory=WrappingConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
 
 
@@ -80,21 +83,33 @@ class WildGS(Method):
         points: Float[Tensor, "P 3"],
         colors: UInt8[Tensor, "P 3"],
         encoder: Encoder | None = None,
+        dense: tuple[Float[Tensor, "D 3"], UInt8[Tensor, "D 3"]] | None = None,
     ) -> WildGS:
-        """Starts from SfM points and their colours, in the scene's aligned frame."""
+        """Starts from SfM points and their colours, in the scene's aligned frame.
+
+        Args:
+            config: The model's configuration.
+            points: SfM points; the triplane covers the central part of them.
+            colors: Their colours.
+            encoder: Overrides the encoder that `config` names.
+            dense: Further points with colours, for Gaussians alone (`wildgs.data.depth_points`).
+        """
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(points, config.wrapping.box_quantile, ratio)
+        sfm_points, sfm_colors = points, colors_to_unit(colors)
+        if dense is not None:
+            points, colors = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
         rows = geometry_from_points(points)
         unit_colors = colors_to_unit(colors)
         if config.sky.points:
-            sky = sky_rows(config.sky, points)
+            sky = sky_rows(config.sky, sfm_points)
             rows = {name: torch.cat([values, sky[name]]) for name, values in rows.items()}
             unit_colors = torch.cat([unit_colors, torch.full((config.sky.points, 3), SKY_COLOR)])
         rows["intrinsic"] = torch.zeros(len(unit_colors), config.fusion.intrinsic_size)
         model = cls(config, Gaussians(rows), box, encoder)
         with torch.no_grad():
             model.gaussians.rows["intrinsic"].copy_(model.fusion.initial_intrinsic(unit_colors))
-        model.wrapping.calibrate(points, unit_colors[: len(points)])
+        model.wrapping.calibrate(sfm_points, sfm_colors)
         return model
 
     def _lacks(self, part: Ablation) -> bool:

@@ -1,0 +1,54 @@
+"""The fusion network: where it starts, and the photo's colour transform."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from wildgs.geometry.spherical_harmonics import sh_basis
+from wildgs.model.fusion import Fusion, FusionConfig
+
+
+def eval_sh(sh: torch.Tensor, directions: torch.Tensor, degree: int) -> torch.Tensor:
+    return (sh_basis(degree, directions)[:, :, None] * sh).sum(dim=1) + 0.5
+
+
+def inputs(fusion: Fusion, colors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    intrinsic = fusion.initial_intrinsic(colors)
+    return torch.randn(16), torch.randn(len(colors), 16), intrinsic
+
+
+def test_starts_near_the_points_colours() -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(), 16, 16)
+    colors = torch.rand(50, 3)
+    sh = fusion(*inputs(fusion, colors))
+    seen = eval_sh(sh, torch.nn.functional.normalize(torch.randn(50, 3), dim=1), 3)
+    assert float((seen - colors).abs().max()) < 0.3
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_the_transform_maps_colours_from_every_direction(degree: int) -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(sh_degree=degree), 16, 16)
+    given = inputs(fusion, torch.rand(50, 3))
+    directions = torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
+    before = eval_sh(fusion(*given), directions, degree)
+    matrix, offset = torch.eye(3) + 0.3 * torch.randn(3, 3), 0.1 * torch.randn(3)
+    assert fusion.transform is not None
+    with torch.no_grad():
+        fusion.transform.bias.copy_(torch.cat([(matrix - torch.eye(3)).flatten(), offset]))
+    torch.testing.assert_close(
+        eval_sh(fusion(*given), directions, degree), before @ matrix.T + offset, atol=1e-4, rtol=0
+    )
+
+
+def test_the_embedding_drives_the_transform() -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(output_scale=0.0), 16, 16)
+    embedding, local, intrinsic = inputs(fusion, torch.rand(8, 3))
+    assert fusion.transform is not None
+    torch.nn.init.normal_(fusion.transform.weight, std=0.1)
+    changed = fusion(embedding, local, intrinsic) - fusion(0 * embedding, local, intrinsic)
+    assert float(changed.detach()[:, 0].abs().min()) > 0
+    assert Fusion(FusionConfig(color_transform=False), 16, 16).transform is None
