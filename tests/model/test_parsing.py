@@ -86,17 +86,25 @@ def test_calibration_tells_photos_apart() -> None:
     assert float(before.std(dim=0).max()) < 0.1
 
 
-@pytest.mark.parametrize("statistics", [True, False])
-def test_a_colour_cast_moves_the_embedding_as_brightness_does(statistics: bool) -> None:
+def test_colour_statistics_alone_tell_casts_and_brightness_apart() -> None:
     torch.manual_seed(0)
-    parsing = Parsing(ParsingConfig(max_side=64, color_statistics=statistics), load_encoder(None))
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
     photos = [torch.rand(64, 64, 3) * brightness for brightness in (0.2, 0.4, 0.6, 0.8, 1.0)]
-    green = torch.tensor([0.97, 1.03, 0.97])
+    green = torch.tensor([0.95, 1.05, 0.95])
     parsing.calibrate([photos[0] * green, *photos[1:3], photos[3] * green, photos[4]])
     with torch.no_grad():
-        brighter = float((parsing(photos[3])[1] - parsing(photos[2])[1]).norm())
-        greener = float((parsing(photos[2] * green)[1] - parsing(photos[2])[1]).norm())
-    assert (greener > 0.3 * brighter) == statistics
+        parsing.global_mlp[0].weight[:, : FEATURE_WIDTHS[-1]] = 0.0
+        embedding = parsing(photos[2])[1]
+        shuffled = photos[2].reshape(-1, 3)[torch.randperm(64 * 64)].reshape(64, 64, 3)
+        torch.testing.assert_close(parsing(shuffled)[1], embedding, atol=1e-4, rtol=0)
+        assert float((parsing(photos[2] * green)[1] - embedding).norm()) > 1
+        assert float((parsing(photos[2] * 0.7)[1] - embedding).norm()) > 1
+
+
+def test_without_colour_statistics_embeddings_are_of_features_alone() -> None:
+    parsing = Parsing(ParsingConfig(max_side=64, color_statistics=False), load_encoder(None))
+    assert parsing.global_mlp[0].in_features == FEATURE_WIDTHS[-1]
+    assert parsing(torch.rand(64, 64, 3))[1].shape == (16,)
 
 
 def test_calibration_on_equal_photos_stays_finite() -> None:

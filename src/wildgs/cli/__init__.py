@@ -65,7 +65,9 @@ def _run(verb: str, arguments: list[str]) -> None:
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", WildGSWarning)
     module = importlib.import_module(f"wildgs.cli.{verb}")
-    command = tyro.cli(module.Command, prog=f"wildgs {verb}", args=arguments)
+    # What a preset among the arguments sets is the default of the other options.
+    kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
+    command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=module.Command.__doc__)
     module.run(command)
 
 

@@ -18,12 +18,15 @@ from wildgs.data.phototourism import find_split_file
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
 from wildgs.model.wildgs import WildGSConfig
+from wildgs.presets import with_preset
 from wildgs.runs import CONFIG_FILE
 
 BenchMethod = Literal[
     "3dgs",
     "wildgs-half-steps",
     "wildgs",
+    "paper",
+    "fast",
     "without-crop",
     "without-reverse",
     "without-global",
@@ -37,6 +40,8 @@ LABELS: dict[str, str] = {
     "3dgs": "3DGS",
     "wildgs-half-steps": "Wild-GS†",
     "wildgs": "Wild-GS",
+    "paper": "preset paper",
+    "fast": "preset fast",
     "without-crop": "w/o Crop",
     "without-reverse": "w/o {c'}",
     "without-global": "w/o Global",
@@ -203,6 +208,8 @@ def method_config(method: BenchMethod, base: RunConfig) -> RunConfig:
         return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
     if method == "wildgs":
         return base
+    if method in ("paper", "fast"):
+        return with_preset(base, method)
     part = method.removeprefix("without-")
     return with_entries(base, {"model.without": [*base.model.without, part]})
 

@@ -23,6 +23,7 @@ MAX_PHOTOS = 200
 _HYPOTHESES = 256
 _TOLERANCE = 0.05
 _MIN_POINTS, _MIN_INLIERS = 24, 0.4
+_MIN_CORRELATION = 0.7  # where all is about as far, a constant fits, and says nothing of what lies between
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ def fit_disparity(
     Points behind what the photo shows, and passers-by before them, do not fit.
 
     Returns:
-        (scale, shift), or None where too few points fit or near is not large.
+        (scale, shift), or None where too few points fit, or disparity does not grow with nearness.
     """
     count = len(disparity)
     if count < _MIN_POINTS:
@@ -149,7 +150,8 @@ def fit_disparity(
         solved = torch.linalg.lstsq(rows * weights, torch.ones_like(weights)).solution[:, 0]
         slope, offset = float(solved[0]), float(solved[1])
         best = _fits(disparity, inverse_depth, slope, offset)
-    return (slope, offset) if slope > 0 else None
+    together = torch.corrcoef(torch.stack([disparity[best], inverse_depth[best]]))[0, 1]
+    return (slope, offset) if slope > 0 and float(together) > _MIN_CORRELATION else None
 
 
 def _fits(disparity: Tensor, inverse_depth: Tensor, scale: Tensor | float, shift: Tensor | float) -> Tensor:

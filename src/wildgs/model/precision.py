@@ -15,6 +15,10 @@ Precision = Literal["auto", "float32", "bfloat16"]
 # of photos of many sizes needs more: two thirds of every step went into compiling again. Read at the first of them.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
 
+# MKL adds up in an order that goes by where in memory a matrix happens to lie, unless told not to: two equal
+# trainings, or one that was resumed, then part in the last bit. Read at its first call.
+os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
+
 
 class MixedModule(nn.Module):
     """A network whose forward pass may run in bfloat16."""

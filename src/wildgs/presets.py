@@ -1,0 +1,55 @@
+"""Named configurations: the paper to the letter, the best that we measured, and the quick one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
+
+from wildgs.config import RunConfig, with_entries
+
+PresetName = Literal["default", "paper", "fast"]
+PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What a named configuration changes.
+
+    Attributes:
+        entries: From an entry's path in `config.yaml` to its plain value.
+        steps: Share of the steps asked for that are taken.
+    """
+
+    entries: Mapping[str, Any] = field(default_factory=dict)
+    steps: float = 1.0
+
+
+PRESETS: dict[PresetName, Preset] = {
+    "default": Preset(),
+    "paper": Preset(
+        {
+            "model.parsing.color_statistics": False,
+            "model.fusion.color_transform": False,
+            "model.depth_points.points": 0,
+            "model.sky.points": 0,
+        }
+    ),
+    "fast": Preset(
+        {
+            "model.parsing.max_side": 192,
+            "train.schedule.encoder_every": 2,
+        },
+        steps=0.5,
+    ),
+}
+"""docs/study.md has the measurements; docs/decisions.md says where the paper leaves the value open."""
+
+
+def with_preset(config: RunConfig, name: PresetName) -> RunConfig:
+    """A configuration with a preset's entries and share of the steps."""
+    preset = PRESETS[name]
+    changed = with_entries(config, preset.entries, f"preset {name}")
+    return replace(
+        changed, train=replace(changed.train, steps=max(1, round(preset.steps * config.train.steps)))
+    )

@@ -1,0 +1,28 @@
+"""Presets: what they set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wildgs.config import RunConfig, differing_entries
+from wildgs.presets import with_preset
+
+BASE = RunConfig(Path("scene"))
+
+
+def test_default_changes_nothing() -> None:
+    assert with_preset(BASE, "default") == BASE
+
+
+def test_paper_leaves_out_all_that_is_ours() -> None:
+    changed = differing_entries(BASE, with_preset(BASE, "paper"))
+    assert {path: new for path, (_, new) in changed.items()} == {
+        "model.parsing.color_statistics": False,
+        "model.fusion.color_transform": False,
+        "model.depth_points.points": 0,
+        "model.sky.points": 0,
+    }
+
+
+def test_fast_takes_half_the_steps_asked_for() -> None:
+    assert with_preset(BASE, "fast").train.steps == BASE.train.steps // 2
