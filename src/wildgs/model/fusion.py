@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.precision import MixedModule
@@ -78,19 +79,31 @@ class Fusion(MixedModule):
         The first layer is split: the global embedding's share is the same for all Gaussians and computed once.
         """
         rows = torch.cat([local_embeddings, intrinsic], dim=1)
+        output, direct, bias = self._last_layers(global_embedding)
         with self.mixed(rows.device):
             hidden = (self.first_rows(rows) + self.first_global(global_embedding)).relu()
             hidden = self.second(hidden).relu()
-            fused = self.output(hidden)
+            fused = functional.linear(hidden, output, bias)
         # The direct path carries the base colour and stays in full precision.
-        sh = (fused.float() + self.direct(intrinsic)).reshape(-1, self.coefficients, 3)
-        return sh if self.transform is None else _transformed(sh, self.transform(global_embedding))
+        return torch.addmm(fused.float(), intrinsic, direct.T).reshape(-1, self.coefficients, 3)
 
+    def _last_layers(
+        self, global_embedding: Float[Tensor, " G"]
+    ) -> tuple[Float[Tensor, "O H"], Float[Tensor, "O I"], Float[Tensor, " O"]]:
+        """Weights of the output and the direct path, and their bias, with the colour transform taken in.
 
-def _transformed(sh: Float[Tensor, "N K 3"], change: Float[Tensor, " 12"]) -> Float[Tensor, "N K 3"]:
-    """Harmonics of the colours ``c + A c + b``, with A (row by row) and b in `change`."""
-    matrix, offset = torch.eye(3).to(change) + change[:9].reshape(3, 3), change[9:]
-    grey = torch.full_like(offset, 0.5)
-    sh = sh @ matrix.T
-    flat = sh[:, :1] + rgb_to_sh0(matrix @ grey + offset)
-    return torch.cat([flat, sh[:, 1:]], dim=1)
+        All three are linear, so that colours ``c + A c + b`` cost no pass over the Gaussians.
+        """
+        output, direct, bias = self.output.weight, self.direct.weight, self.output.bias
+        if self.transform is None:
+            return output, direct, bias
+        change = self.transform(global_embedding)
+        matrix = torch.eye(3).to(change) + change[:9].reshape(3, 3)
+        # Harmonics are colours around grey, which the transform moves too.
+        flat = rgb_to_sh0(matrix @ torch.full_like(change[9:], 0.5) + change[9:])
+
+        def colors_mapped(weight: Float[Tensor, "O X"]) -> Float[Tensor, "O X"]:
+            return (matrix @ weight.reshape(self.coefficients, 3, -1)).reshape(weight.shape)
+
+        offset = torch.cat([flat, flat.new_zeros(3 * self.coefficients - 3)])
+        return colors_mapped(output), colors_mapped(direct), colors_mapped(bias[:, None])[:, 0] + offset
