@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
+import yaml.composer
 
 from wildgs.data import DataConfig
 from wildgs.engine.trainer import TrainConfig

@@ -102,7 +102,7 @@ def read_model(root: Path) -> ColmapModel:
         raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
     registered = _usable(records, folder)
     with np.errstate(invalid="ignore"):
-        finite = (np.abs(records.points.xyz) < MAX_COORDINATE).all(axis=1)
+        finite = np.all(np.abs(records.points.xyz) < MAX_COORDINATE, axis=1)
     if not finite.any():
         raise UserError(
             f"{folder}: the COLMAP model holds no points, and training starts from them; triangulate it"

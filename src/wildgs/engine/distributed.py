@@ -111,7 +111,7 @@ class Ranks(Team):
         with _peers():
             sum_over_ranks([*gradients, terms])
         if gradients:
-            torch._foreach_div_(gradients, self.size)
+            torch._foreach_div_(gradients, self.size)  # pyright: ignore[reportPrivateImportUsage]
         image, mask, depth, total = (terms / self.size).unbind()
         return Losses(image=image, mask=mask, depth=depth, total=total)
 

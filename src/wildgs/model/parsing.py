@@ -125,6 +125,8 @@ class Parsing(MixedModule):
         self.encoder.calibrate(squares)
         if len(photos) > 1:
             first, last = self.global_mlp[0], self.global_mlp[-1]
+            assert isinstance(first, nn.Linear)
+            assert isinstance(last, nn.Linear)
             summary = self._summary(squares, self.encoder(squares)[-1])
             deep = FEATURE_WIDTHS[-1]
             _standardize_input(first, summary, slice(0, deep))

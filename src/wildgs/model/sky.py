@@ -28,14 +28,15 @@ class SkyConfig:
         radius: Of the shell, in units of the aligned frame (photos' median depth); more where the scene's points
             reach further.
         reach: The shell lies at this multiple of the distance within which nearly all points are, at least.
-        lowest: Elevation at which the shell ends, degrees; a little below the horizon.
+        lowest: Elevation at which the shell ends, degrees. Below the horizon it closes the scene behind ground that
+            too few photos show: such holes are as dark as the background otherwise.
         opacity: Of its Gaussians at the start.
     """
 
-    points: int = 3000
+    points: int = 5000
     radius: float = 10.0
     reach: float = 2.0
-    lowest: float = -10.0
+    lowest: float = -90.0
     opacity: float = 0.5
 
 

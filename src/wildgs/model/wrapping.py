@@ -84,7 +84,9 @@ class Wrapping(MixedModule):
         inside = self.box.contains(points)
         if int(inside.sum()) > 1:
             sampled = sample_planes(self.planes(points, colors), self.box.normalize(points[inside]))
-            standardize_output(self.local_mlp[-1], self.local_mlp(sampled))
+            last = self.local_mlp[-1]
+            assert isinstance(last, nn.Linear)
+            standardize_output(last, self.local_mlp(sampled))
 
     def local_embeddings(
         self, planes: Float[Tensor, "3 C R R"] | None, means: Float[Tensor, "N 3"]
