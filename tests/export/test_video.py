@@ -13,6 +13,11 @@ from PIL import Image
 from wildgs.errors import UserError
 from wildgs.export.video import check_output, write_frames
 
+# imageio-ffmpeg leaves its pipes to the garbage collector, which is heard of in whatever test it comes to.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:unclosed file:ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
 WIDTH, HEIGHT, COUNT = 66, 34, 12
 
 

@@ -24,6 +24,7 @@ from wildgs.errors import WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import create_method
+from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
 from wildgs.viewer.subject import Subject
@@ -70,6 +71,7 @@ def wall() -> Scene:
 
 def make_trainer(scene: Scene, steps: int, method="wildgs") -> Trainer:
     model = WildGSConfig(
+        sky=SkyConfig(points=0),
         parsing=ParsingConfig(max_side=32, encoder="nobody/none"),
         wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)),
     )

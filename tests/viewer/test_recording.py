@@ -21,6 +21,11 @@ from wildgs.viewer.subject import Subject
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 
+# imageio-ffmpeg leaves its pipes to the garbage collector, which is heard of in whatever test it comes to.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:unclosed file:ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
 
 @pytest.fixture
 def panel(tmp_path: Path) -> Iterator[RecordingPanel]:
