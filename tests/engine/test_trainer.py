@@ -45,7 +45,7 @@ def test_wildgs_separates_lights_that_the_baseline_averages(
 ) -> None:
     errors = {}
     for method in ("wildgs", "3dgs"):
-        trainer = trainer_for(wall_scene, tiny_model, 150, method)
+        trainer = trainer_for(wall_scene, tiny_model, 220, method)
         trainer.run()
         view = wall_scene.test_views[0]
         photo = view.read_photo().float() / 255
