@@ -46,6 +46,7 @@ def drawn(viewer: Viewer, size: int = 256) -> np.ndarray:
     """What the browser draws from the first photo's camera, without panels; cameras hidden."""
     client = next(iter(viewer.server.get_clients().values()))
     pose = pose_of(viewer.subject.views[0].camera)
+    client.camera.fov = pose.fov  # splats are drawn with the window's, whatever the picture's is
     picture = client.get_render(
         size, size, wxyz=pose.wxyz, position=pose.position, fov=pose.fov, transport_format="png", timeout=120
     )
