@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from PIL import Image
 
 from wildgs.evaluation.metrics import psnr
-from wildgs.viewer.cameras import pose_of
+from wildgs.viewer.cameras import Pose, camera_of, pose_of
 from wildgs.viewer.jobs import start_worker
 from wildgs.viewer.server import ServerConfig, address, open_server
 from wildgs.viewer.subject import Subject
@@ -21,6 +22,7 @@ from wildgs.viewer.viewer import Viewer, ViewerConfig
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 pytestmark = [pytest.mark.chromium, pytest.mark.timeout(600)]
 
+HEIGHT = 256
 LIBRARY_NOISE = "computeBoundingSphere"
 """viser's own splat mesh has positions of two numbers, at which three.js complains."""
 
@@ -42,13 +44,26 @@ def wait_for(condition: Callable[[], object], seconds: float = 120) -> None:
         time.sleep(0.1)
 
 
-def drawn(viewer: Viewer, size: int = 256) -> np.ndarray:
-    """What the browser draws from the first photo's camera, without panels; cameras hidden."""
+def first_pose(viewer: Viewer) -> Pose:
+    """The first photo's camera in the shape of the window: viser draws splats for the window, whatever is asked."""
     client = next(iter(viewer.server.get_clients().values()))
-    pose = pose_of(viewer.subject.views[0].camera)
-    client.camera.fov = pose.fov  # splats are drawn with the window's, whatever the picture's is
+    return replace(pose_of(viewer.subject.views[0].camera), aspect=client.camera.aspect)
+
+
+def drawn(viewer: Viewer) -> np.ndarray:
+    """What the browser draws from `first_pose`, without panels; cameras hidden."""
+    client = next(iter(viewer.server.get_clients().values()))
+    pose = first_pose(viewer)
+    client.camera.fov = pose.fov
+    width = camera_of(pose, HEIGHT).width
     picture = client.get_render(
-        size, size, wxyz=pose.wxyz, position=pose.position, fov=pose.fov, transport_format="png", timeout=120
+        HEIGHT,
+        width,
+        wxyz=pose.wxyz,
+        position=pose.position,
+        fov=pose.fov,
+        transport_format="png",
+        timeout=120,
     )
     return picture[..., :3]
 
@@ -78,8 +93,9 @@ def test_page_draws_what_the_rasteriser_draws(
         viewer.lighting.set_amount(amount)
         wait_for(lambda: viewer._lit_by == viewer.lighting.desk)
         pictures[amount] = settled(viewer)
-        camera = subject.views[0].camera.resized(256, 256)
-        expected, _ = subject.render(camera, viewer.lighting.desk.look(subject))
+        expected, _ = subject.render(
+            camera_of(first_pose(viewer), HEIGHT), viewer.lighting.desk.look(subject)
+        )
         assert psnr(torch.from_numpy(pictures[amount].copy()), expected) > 25
     lit = (pictures[0.0].max(axis=2) > 8).mean()
     assert lit > 0.5, "most of the picture is not background"
