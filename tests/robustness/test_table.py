@@ -233,6 +233,16 @@ def test_scenes(name: str, fault: str, scene: Path, make_model) -> None:
         assert len(views) == (6 if name == "depth" else 5)
 
 
+def test_points_that_no_photo_observes_make_a_scene_all_the_same(scene: Path, make_model) -> None:
+    """Found by benchmarks/fuzz.py; other programs write such models too."""
+    spoil_model(scene, "names", make_model(), "txt")
+    path = scene / "sparse/0/points3D.txt"
+    path.write_text("".join(f"{i} {0.1 * i} 0.2 4 9 8 7 0.5\n" for i in range(1, 9)))
+    loaded = load_scene(scene, DataConfig(holdout=0))
+    assert len(loaded.views) == 6
+    assert len(loaded.points) == 8
+
+
 def test_a_text_cut_between_two_lines_is_noticed_by_its_comment(scene: Path, make_model) -> None:
     spoil_model(scene, "names", make_model(), "txt")
     path = scene / "sparse/0/images.txt"

@@ -192,6 +192,8 @@ def _median_depths(
     rows, photos = points.track_point, points.track_image
     known = finite[rows]
     rows, photos = rows[known], photos[known]
+    if len(rows) == 0:
+        return {}
     order = np.argsort(photos, kind="stable")
     ids, starts = np.unique(photos[order], return_index=True)
     depths = {}
