@@ -110,7 +110,12 @@ def lock_run(folder: Path) -> Iterator[None]:
         raise UserError(
             f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
         ) from error
-    except NotImplementedError:  # what filelock raises on disks without locks: training there goes unlocked
+    except NotImplementedError:  # so filelock calls a disk that has no locks, as some network disks
+        warnings.warn(
+            f"{folder} lies on a disk without locks: nothing keeps a second training out of it",
+            WildGSWarning,
+            stacklevel=3,
+        )
         yield
         return
     except OSError as error:

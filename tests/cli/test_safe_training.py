@@ -14,7 +14,7 @@ from wildgs.cli import training
 from wildgs.cli.interrupts import InterruptedTrainingError, StopOnSignal
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.engine.trainer import Trainer
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.runs import load_run, lock_run
 
 TRAIN = ("--method", "3dgs", "--steps", 24, "--checkpoint-every", 5)
@@ -130,6 +130,15 @@ def test_a_run_in_use_is_locked(undisturbed: Path, landmark: Path, tmp_path: Pat
     with lock_run(undisturbed), pytest.raises(UserError, match="in use"), lock_run(undisturbed):
         pass
     assert load_run(undisturbed).step == 24, "reading is always allowed"
+
+
+def test_a_disk_without_locks_is_said_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise NotImplementedError("no flock")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refuse)
+    with pytest.warns(WildGSWarning, match="disk without locks"), lock_run(tmp_path / "run"):
+        (tmp_path / "run" / "file").touch()
 
 
 def test_a_folder_that_cannot_be_written_is_said(landmark: Path, tmp_path: Path, wildgs, capsys) -> None:

@@ -86,6 +86,7 @@ def test_gaussforge_reads_the_spz_in_the_formats_own_axes(splats: Splats, tmp_pa
     write_splats(file, splats, "spz")
     read = gaussforge.GaussForge().read(file.read_bytes(), "spz")["data"]
     places = np.frombuffer(read["positions"], "<f4").reshape(-1, 3)
+    assert places.shape == (len(splats), 3)
     flip = torch.tensor([1.0, -1.0, -1.0])
     _close(places, splats.means * flip, 1e-4)
     turned = splats.turned(torch.diag(flip))

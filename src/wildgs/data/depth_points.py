@@ -23,6 +23,7 @@ MAX_PHOTOS = 200
 _HYPOTHESES = 256
 _TOLERANCE = 0.05
 _MIN_POINTS, _MIN_INLIERS = 24, 0.4
+_MAX_POINTS = 20_000  # of a photo; more make no better fit and a table of 256 times as many numbers
 _MIN_CORRELATION = 0.7  # where all is about as far, a constant fits, and says nothing of what lies between
 
 
@@ -46,11 +47,14 @@ class DepthPointsConfig:
 
 
 @dataclass(frozen=True)
-class _Depth:
-    """A photo's disparity as depth in the scene's scale; 0 where it says nothing."""
+class _Seen:
+    """What one photo says: some of its pixels as points, and its depth at every `step`-th pixel, 0 for nothing."""
 
-    view: View
-    depth: Float[Tensor, "H W"]
+    points: Float[Tensor, "S 3"]
+    colors: Float[Tensor, "S 3"]
+    camera: Camera
+    depth: Float[Tensor, "h w"]
+    step: int
 
 
 def depth_points(
@@ -70,19 +74,16 @@ def depth_points(
     if config.points == 0:
         return nothing
     generator = torch.Generator().manual_seed(seed)
-    depths = [
-        depth for view in _evenly(scene.train_views) if (depth := _fitted(view, scene.points, generator))
-    ]
-    if not depths:
+    views = _evenly(scene.train_views)
+    photos = [seen for view in views if (seen := _look(view, scene.points, config, generator))]
+    if not photos:
         return nothing
-    samples = [_samples(each, config) for each in depths]
-    points = torch.cat([each for each, _ in samples])
-    colors = torch.cat([each for _, each in samples])
-    photos = torch.cat([torch.full((len(each),), index) for index, (each, _) in enumerate(samples)])
-    means, means_of_color, support = _by_cell(points, colors, photos, config.cell)
+    points, colors = torch.cat([seen.points for seen in photos]), torch.cat([seen.colors for seen in photos])
+    sources = torch.cat([torch.full((len(seen.points),), index) for index, seen in enumerate(photos)])
+    means, means_of_color, support = _by_cell(points, colors, sources, config.cell)
     kept = (support >= config.support) & ~_near(means, scene.points, config.cell)
     means, means_of_color, support = means[kept], means_of_color[kept], support[kept]
-    kept = support >= config.agreement * (support + _seen_through(means, depths, config.cell))
+    kept = support >= config.agreement * (support + _seen_through(means, photos, config.cell))
     means, means_of_color = means[kept], means_of_color[kept]
     if len(means) > config.points:
         chosen = torch.randperm(len(means), generator=generator)[: config.points].sort().values
@@ -96,31 +97,43 @@ def _evenly(views: Sequence[View]) -> list[View]:
     return [views[round(index)] for index in torch.linspace(0, len(views) - 1, MAX_PHOTOS).tolist()]
 
 
-def _project(points: Float[Tensor, "P 3"], camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Column and row (always within the picture) and depth of every point, and whether the picture has it."""
-    seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = seen[:, 2]
-    pixels = seen @ camera.K.T
-    x, y = (pixels[:, 0] / z.clamp_min(1e-6)).floor(), (pixels[:, 1] / z.clamp_min(1e-6)).floor()
-    inside = (z > 1e-3) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    return x.clamp(0, camera.width - 1).long(), y.clamp(0, camera.height - 1).long(), z, inside
+def _looked_up(
+    points: Float[Tensor, "P 3"], camera: Camera, picture: Float[Tensor, "h w"], step: int = 1
+) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """Depth of every point, and what a picture (of every `step`-th pixel) has there: 0 for points outside it."""
+    pixels, z = camera.project(points)
+    size = torch.tensor([camera.width, camera.height])
+    inside = (z > 1e-3) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    x, y = torch.where(inside[:, None], pixels, 0.0).long().div(step, rounding_mode="floor").unbind(dim=1)
+    return z, torch.where(inside, picture[y, x], 0.0)
 
 
-def _fitted(view: View, points: Float[Tensor, "P 3"], generator: torch.Generator) -> _Depth | None:
-    """The photo's depth in the scene's scale, or None where it has no disparity that fits the points."""
+def _look(
+    view: View, points: Float[Tensor, "P 3"], config: DepthPointsConfig, generator: torch.Generator
+) -> _Seen | None:
+    """What a photo says in the scene's scale; None where it has no disparity that fits the points."""
     disparity = view.read_disparity()
     if disparity is None:
         return None
-    x, y, z, inside = _project(points, view.camera)
-    sampled = disparity[y, x]
-    inside = inside & (sampled > 0)
-    fit = fit_disparity(sampled[inside], 1 / z[inside], generator)
+    z, sampled = _looked_up(points, view.camera, disparity)
+    known = sampled > 0
+    fit = fit_disparity(sampled[known], 1 / z[known], generator)
     if fit is None:
         return None
     inverse = fit[0] * disparity + fit[1]
-    # Beyond the farthest point that was fitted, a small error of the disparity is a large one of depth.
-    reliable = (disparity > 0) & (inverse > (1 / z[inside]).quantile(0.02))
-    return _Depth(view, torch.where(reliable, 1 / inverse.clamp_min(1e-6), 0.0))
+    # Beyond the farthest points that were fitted, a small error of the disparity is a large one of depth.
+    reliable = (disparity > 0) & (inverse * z[known].sort().values[int(0.98 * (int(known.sum()) - 1))] > 1)
+    depth = torch.where(reliable, 1 / inverse.clamp_min(1e-6), 0.0)
+    step = max(
+        1, int(0.5 * config.cell * float(view.camera.K[0, 0]))
+    )  # two to a cell's side at the usual depth
+    keep = (depth > 0) & (depth < config.farthest)
+    mask = view.read_mask()
+    if mask is not None:
+        keep = keep & (mask > 0)
+    keep, places = keep[::step, ::step], view.camera.unproject(depth)[::step, ::step]
+    colors = view.read_photo()[::step, ::step][keep].float()
+    return _Seen(places[keep], colors, view.camera, depth[::step, ::step].contiguous(), step)
 
 
 def fit_disparity(
@@ -136,6 +149,9 @@ def fit_disparity(
     count = len(disparity)
     if count < _MIN_POINTS:
         return None
+    if count > _MAX_POINTS:
+        some = torch.randperm(count, generator=generator)[:_MAX_POINTS]
+        disparity, inverse_depth, count = disparity[some], inverse_depth[some], _MAX_POINTS
     pairs = torch.randint(count, (2, _HYPOTHESES), generator=generator)
     run = disparity[pairs[0]] - disparity[pairs[1]]
     scale = (inverse_depth[pairs[0]] - inverse_depth[pairs[1]]) / torch.where(run.abs() > 1e-9, run, 1e-9)
@@ -150,24 +166,14 @@ def fit_disparity(
         solved = torch.linalg.lstsq(rows * weights, torch.ones_like(weights)).solution[:, 0]
         slope, offset = float(solved[0]), float(solved[1])
         best = _fits(disparity, inverse_depth, slope, offset)
+    if int(best.sum()) < _MIN_POINTS // 2:
+        return None
     together = torch.corrcoef(torch.stack([disparity[best], inverse_depth[best]]))[0, 1]
     return (slope, offset) if slope > 0 and float(together) > _MIN_CORRELATION else None
 
 
 def _fits(disparity: Tensor, inverse_depth: Tensor, scale: Tensor | float, shift: Tensor | float) -> Tensor:
     return (scale * disparity + shift - inverse_depth).abs() < _TOLERANCE * inverse_depth
-
-
-def _samples(found: _Depth, config: DepthPointsConfig) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
-    """Points and colours of a photo's pixels, about two to a cell's side at the median depth."""
-    view = found.view
-    step = max(1, int(0.5 * config.cell * float(view.camera.K[0, 0])))
-    keep = (found.depth > 0) & (found.depth < config.farthest)
-    mask = view.read_mask()
-    if mask is not None:
-        keep = keep & (mask > 0)
-    keep, grid = keep[::step, ::step], view.camera.unproject(found.depth)[::step, ::step]
-    return grid[keep], view.read_photo()[::step, ::step][keep].float()
 
 
 def _cells(points: Float[Tensor, "P 3"], cell: float) -> Int[Tensor, " P"]:
@@ -193,10 +199,10 @@ def _near(points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"], cell: floa
     return torch.isin(_cells(points, cell), _cells(others, cell))
 
 
-def _seen_through(points: Float[Tensor, "P 3"], depths: Sequence[_Depth], cell: float) -> Int[Tensor, " P"]:
+def _seen_through(points: Float[Tensor, "P 3"], photos: Sequence[_Seen], cell: float) -> Int[Tensor, " P"]:
     """How many photos see something clearly beyond each point."""
     through = torch.zeros(len(points), dtype=torch.int64)
-    for each in depths:
-        x, y, z, inside = _project(points, each.view.camera)
-        through += inside & (each.depth[y, x] > (1 + 2 * _TOLERANCE) * z + cell)
+    for seen in photos:
+        z, depth = _looked_up(points, seen.camera, seen.depth, seen.step)
+        through += depth > (1 + 2 * _TOLERANCE) * z + cell
     return through

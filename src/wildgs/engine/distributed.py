@@ -124,11 +124,11 @@ class Ranks(Team):
             dist.all_reduce(message, op=dist.ReduceOp.MAX, group=self._control)
         self._verdict, most, least, *present = message.tolist()
         if most != -least:
-            message = (
+            said = (
                 f"the ranks' models differ in size ({-least:,} and {most:,} numbers); --resume goes on from the "
                 "newest checkpoint, which all ranks take from rank 0"
             )
-            raise DivergedRanksError(message) if self.first else ReportedError(message)
+            raise DivergedRanksError(said) if self.first else ReportedError(said)
         for parameter, somewhere in zip(parameters, present, strict=True):
             if somewhere and parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)

@@ -31,11 +31,9 @@ def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tup
 
 def _project(camera: Camera, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
     """Places in the picture (0 to 1 on each axis) and depths of the points before the camera."""
-    seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    seen = seen[seen[:, 2] > 1e-3]
-    pixels = seen @ camera.K.T
-    size = torch.tensor([camera.width, camera.height]).to(points)
-    return pixels[:, :2] / pixels[:, 2:] / size, seen[:, 2]
+    pixels, depths = camera.project(points)
+    before = depths > 1e-3
+    return pixels[before] / torch.tensor([camera.width, camera.height]).to(points), depths[before]
 
 
 def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:

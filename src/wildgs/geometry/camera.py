@@ -59,6 +59,20 @@ class Camera:
         K[1, 2] -= top
         return replace(self, K=K, width=width, height=height)
 
+    def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
+        """Where the picture has world points.
+
+        Args:
+            points: World coordinates.
+
+        Returns:
+            Pixel coordinates (x, y), without meaning where the depth is not positive, and depths along the
+            camera's z axis.
+        """
+        seen = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        pixels = seen @ self.K.T
+        return pixels[:, :2] / pixels[:, 2:], seen[:, 2]
+
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
         """World points of all pixels at the given depths.
 

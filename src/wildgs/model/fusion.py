@@ -98,7 +98,7 @@ class Fusion(MixedModule):
         if self.transform is None:
             return output, direct, bias
         change = self.transform(global_embedding)
-        matrix = torch.eye(3).to(change) + change[:9].reshape(3, 3)
+        matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:9].reshape(3, 3)
         # Harmonics are colours around grey, which the transform moves too.
         flat = rgb_to_sh0(matrix @ torch.full_like(change[9:], 0.5) + change[9:])
 

@@ -48,6 +48,8 @@ class ParsingConfig:
 class Parsing(MixedModule):
     """UNet with a ResNet-18 encoder: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder)."""
 
+    opponents: Tensor
+
     def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
         """Sets up a `Parsing`.
 
@@ -58,6 +60,7 @@ class Parsing(MixedModule):
         super().__init__()
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
+        self.register_buffer("opponents", torch.tensor(OPPONENTS), persistent=False)
         deep = FEATURE_WIDTHS[-1]
         summary = deep + (STATISTICS if config.color_statistics else 0)
         self.global_mlp = nn.Sequential(
@@ -102,8 +105,8 @@ class Parsing(MixedModule):
         pooled = deepest.float().mean(dim=(2, 3))
         if not self.config.color_statistics:
             return pooled
-        opponents = torch.einsum("oc, bchw -> bohw", torch.tensor(OPPONENTS).to(images), images)
-        spread, mean = torch.std_mean(opponents.float(), dim=(2, 3), correction=0)
+        opponents = torch.einsum("oc, bchw -> bohw", self.opponents, images)
+        spread, mean = torch.std_mean(opponents, dim=(2, 3), correction=0)
         return torch.cat([pooled, mean, spread], dim=1)
 
     @torch.no_grad()
