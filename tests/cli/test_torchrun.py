@@ -1,4 +1,4 @@
-"""`torchrun -m wildgs train`: one voice, one writer, a clean stop, a lost rank, and going on with other numbers."""
+"""`torchrun -m wildgs`: one voice, one writer, a clean stop, a lost rank, other numbers, and a bench spread out."""
 
 from __future__ import annotations
 
@@ -108,6 +108,36 @@ def test_a_mistake_is_told_once(tmp_path: Path) -> None:
     assert line.startswith("error: ")
     assert "nowhere" in line
     assert str(SOURCE / "wildgs") not in errors  # no traceback of this program
+
+
+BENCH = ("--steps", "4", "--methods", "3dgs")
+
+
+def test_bench_spreads_its_runs(landmark: Path, tmp_path: Path) -> None:
+    process = torchrun("bench", landmark, "--output", tmp_path, "--seeds", "0", "1", "2", *BENCH)
+    output, errors = process.communicate()
+    assert process.returncode == 0, errors
+    speakers = [line.split(":")[0] for line in output.splitlines() if ": run " in line]
+    assert sorted(set(speakers)) == ["rank 0", "rank 1"]
+    assert len(speakers) == 3  # each run once
+    table = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))
+    assert sorted(run["seed"] for run in table["runs"]) == [0, 1, 2]
+    again = torchrun("bench", landmark, "--output", tmp_path, "--seeds", "0", "1", "2", *BENCH)
+    output, errors = again.communicate()
+    assert again.returncode == 0, errors
+    assert ": run " not in output
+
+
+def test_a_failed_run_of_the_bench_is_told_once_after_the_others(landmark: Path, tmp_path: Path) -> None:
+    (tmp_path / landmark.name / "3dgs" / "seed_1").mkdir(parents=True)
+    (tmp_path / landmark.name / "3dgs" / "seed_1" / "checkpoints").write_text("in the way")
+    process = torchrun("bench", landmark, "--output", tmp_path, "--seeds", "0", "1", "2", *BENCH)
+    _, errors = process.communicate()
+    assert process.returncode != 0
+    (line,) = told(errors)
+    assert "1 of 3 runs failed" in line
+    table = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))
+    assert sorted(run["seed"] for run in table["runs"]) == [0, 2]
 
 
 def test_other_verbs_refuse_torchrun(wildgs, monkeypatch, capsys, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ VERBS = {
     "bench": "methods x ablations x seeds on scenes -> one table",
     "doctor": "what works on this machine, and how to get what does not",
 }
-DISTRIBUTED = ("train",)
+DISTRIBUTED = ("train", "bench")
 """Verbs that torchrun may start on several processes."""
 USER_ERROR = 2
 logging.getLogger("wildgs").addHandler(logging.NullHandler())  # or Python prints what is logged a second time

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +12,7 @@ import torch
 import tyro
 from rich.table import Table
 
+from wildgs import launch
 from wildgs.cli.bench_plan import (
     LABELS,
     METHODS,
@@ -28,8 +29,10 @@ from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.engine.checkpoint import list_checkpoints
+from wildgs.engine.distributed import settle
+from wildgs.engine.job_queue import JobQueue
 from wildgs.engine.trainer import TrainConfig
-from wildgs.errors import UserError
+from wildgs.errors import ReportedError, UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
 from wildgs.evaluation.benchmark_table import sections, to_csv, to_markdown, to_records
 from wildgs.evaluation.lpips_weights import load_lpips
@@ -53,6 +56,7 @@ class Command:
 
     The same command goes on where it stopped and skips what is done; with more scenes, methods, variants or
     seeds it does what is new. The table (table.md, table.csv, table.json) is written anew after every run.
+    Started by torchrun, every process takes the next run that nobody has.
 
     Example: wildgs bench scenes/gate --output bench --steps 3000 --downscale 2 --methods 3dgs wildgs
     """
@@ -84,22 +88,58 @@ def run(command: Command) -> None:
     Raises:
         UserError: The command makes no sense, or some runs failed.
     """
-    jobs = _plan(command)
+    queue = JobQueue("bench")
+    if launch.world_size() > 1:
+        settle()
+    jobs = _plan_together(command, queue)
+    console.quiet = not queue.first
     bench = _Bench(command, jobs)
-    todo = [job for job in jobs if not bench.is_done(job)]
-    console.print(f"{len(jobs)} runs, {len(jobs) - len(todo)} of them done already -> {command.output}")
-    for number, job in enumerate(todo, start=1):
-        console.print(f"run {number} of {len(todo)}: {job.title}", style="bold")
-        bench.do(job)
-        bench.write_table()
-    _print_table(bench.write_table())
+    done = sum(map(bench.is_done, jobs))
+    console.print(f"{len(jobs)} runs, {done} of them done already -> {command.output}")
+    for number in queue.take(len(jobs)):
+        if bench.is_done(jobs[number]):
+            continue
+        print(f"{_speaker()}run {number + 1} of {len(jobs)}: {jobs[number].title}", flush=True)
+        bench.do(jobs[number])
+        if queue.first:
+            bench.write_table()
+    failures = queue.gather("failures", bench.failures)
+    if queue.first:
+        _print_table(bench.write_table())
     console.print(f"{command.output / 'table.md'}, table.csv and table.json hold the table")
-    if bench.failures:
-        title, reason = next(iter(bench.failures.items()))
-        raise UserError(
-            f"{len(bench.failures)} of {len(jobs)} runs failed, the first of them {title} ({reason}); the same "
-            "command tries them again"
-        )
+    if failures:
+        _tell(failures, len(jobs), queue)
+
+
+def _plan_together(command: Command, queue: JobQueue) -> list[Job]:
+    """The jobs, which must make sense to all processes; the first one tells what does not."""
+    jobs: list[Job] = []
+    own: dict[str, str] = {}
+    try:
+        jobs = _plan(command)
+    except UserError as error:
+        own = {_speaker(): str(error)}
+    mistakes = queue.gather("mistakes", own)
+    if not mistakes:
+        return jobs
+    if not queue.first:
+        raise ReportedError("the bench makes no sense")
+    speaker, mistake = next(iter(mistakes.items()))
+    raise UserError(mistake if speaker == _speaker() else f"{speaker}{mistake}")
+
+
+def _tell(failures: Mapping[str, str], count: int, queue: JobQueue) -> None:
+    if not queue.first:
+        raise ReportedError("a run of the bench failed")
+    title, reason = next(iter(failures.items()))
+    raise UserError(
+        f"{len(failures)} of {count} runs failed, the first of them {title} ({reason}); the same "
+        "command tries them again"
+    )
+
+
+def _speaker() -> str:
+    return f"rank {launch.rank()}: " if launch.world_size() > 1 else ""
 
 
 def _plan(command: Command) -> list[Job]:
@@ -149,7 +189,7 @@ class _Bench:
         except (UserError, MemoryError, torch.OutOfMemoryError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             self.failures[job.title] = reason
-            console.print(f"failed: {reason}", style="red")
+            print(f"{_speaker()}failed: {reason}", flush=True)
 
     def _read_scene(self, config: RunConfig) -> Scene:
         """The scene of a run, kept for the next run where that reads it alike."""
