@@ -63,3 +63,12 @@ def test_exponential_ends() -> None:
     assert exponential(1.0, 0.01, 0.0) == pytest.approx(1.0)
     assert exponential(1.0, 0.01, 0.5) == pytest.approx(0.1)
     assert exponential(1.0, 0.01, 1.0) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 3, 8])
+def test_the_encoder_learns_as_often_however_many_photos_a_step_has(ranks: int) -> None:
+    """Steps that have a photo on which one process would teach the encoder teach it."""
+    schedule = Schedule(ScheduleConfig(encoder_every=4), 30_000)
+    steps = range(0, 240, ranks)
+    learning = {step for step in steps if schedule.stage(step, 3, ranks).learn_encoder}
+    assert learning == {step for step in steps if any(photo % 4 == 0 for photo in range(step, step + ranks))}

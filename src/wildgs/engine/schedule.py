@@ -81,18 +81,19 @@ class Schedule:
         """Share of the run that lies behind, in [0, 1]."""
         return min(step / max(self.steps - 1, 1), 1.0)
 
-    def stage(self, step: int, sh_degree: int) -> Stage:
+    def stage(self, step: int, sh_degree: int, taken: int = 1) -> Stage:
         """What the method's forward pass does at a step.
 
         Args:
             step: From 0.
             sh_degree: The method's full degree.
+            taken: For how many steps this one will count.
         """
         return Stage(
             explicit=step >= self.first_stage,
             learn_mask=not self.mask_paused(step),
             sh_degree=min(step // self.sh_every, sh_degree),
-            learn_encoder=step % self.encoder_every == 0,
+            learn_encoder=falls_on(step + taken - 1, taken, self.encoder_every),
         )
 
     def mask_paused(self, step: int) -> bool:

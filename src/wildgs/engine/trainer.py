@@ -232,7 +232,7 @@ class Trainer:
         photo = view.read_photo().to(self.device).float() / 255
         mask = view.read_mask()
         keep = None if mask is None else mask.to(self.device) > 0
-        stage = self.schedule.stage(self.step, self.method.sh_degree)
+        stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         output = self.method.training_pass(photo, view.camera.to(self.device), stage, keep)
         disparity = view.read_disparity() if self.method.depth_supervised and stage.explicit else None
         losses = total_loss(
