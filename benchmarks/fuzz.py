@@ -117,6 +117,30 @@ def _read_pycolmap(folder: Path) -> object:
     return pycolmap.Reconstruction(folder / "sparse" / "0")
 
 
+def _exif(folder: Path) -> list[str]:
+    from PIL import Image
+
+    photo = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    exif = photo.getexif()
+    exif[0x010F], exif[0x0110] = "Canon", "Canon EOS 5D"
+    camera, gps = exif.get_ifd(0x8769), exif.get_ifd(0x8825)
+    camera[0xA405], camera[0x920A], camera[0xA20E], camera[0xA210] = 35, 24.0, 3000.0, 2
+    gps[1], gps[2], gps[3], gps[4], gps[6] = "N", (48.0, 53.0, 12.0), "E", (2.0, 20.0, 35.0), 130.0
+    photo.save(folder / "photo.jpg", exif=exif)
+    return ["photo.jpg"]
+
+
+def _infer_camera(folder: Path) -> object:
+    """As `wildgs sfm` does: COLMAP gets what Pillow could read."""
+    import pycolmap
+
+    from wildgs.data.images import read_photo
+
+    _tolerate(
+        lambda: read_photo(folder / "photo.jpg") and pycolmap.infer_camera_from_image(folder / "photo.jpg")
+    )
+
+
 def _pictures(folder: Path) -> list[str]:
     from PIL import Image
 
@@ -211,6 +235,7 @@ READERS = {
 PYCOLMAP = {
     "pycolmap binary": Reader(_scene("bin"), _read_pycolmap),
     "pycolmap text": Reader(_scene("txt"), _read_pycolmap),
+    "pycolmap EXIF": Reader(_exif, _infer_camera),
 }
 _NUMBERS = [0, 1, 2**31 - 1, 2**32 - 1, 2**63, 2**64 - 1, 10**6, 10**9]
 _TOKENS = [

@@ -139,6 +139,22 @@ def test_focal_length_from_exif(corner, corner_landmarks, save_query) -> None:
     assert_found(found, corner)
 
 
+def test_colmap_sees_no_byte_of_a_strangers_file(save_query, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = save_query("query.jpg", comment=b"hostile", exif=Image.Exif())
+    handed: list[bytes] = []
+    infer = pycolmap.infer_camera_from_image
+
+    def record(path: Path):
+        handed.append(Path(path).read_bytes())
+        return infer(path)
+
+    monkeypatch.setattr(pycolmap, "infer_camera_from_image", record)
+    guess_camera(file, 320, 240)
+    assert b"hostile" in file.read_bytes()
+    (content,) = handed
+    assert b"hostile" not in content
+
+
 def test_the_camera_stands_in_the_aligned_frame(corner, corner_landmarks, save_query) -> None:
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     alignment = Alignment(turn, torch.tensor([3.0, 0, 1], dtype=torch.float64), 0.5)

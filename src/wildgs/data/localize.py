@@ -6,6 +6,7 @@ focal length is that of the EXIF block, or estimated with the pose.
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,12 @@ from jaxtyping import Float64, UInt8
 from PIL import Image
 from torch import Tensor
 
-from wildgs.data.images import UnreadableImageError, read_photo
+from wildgs.data.images import UnreadableImageError, open_image, read_photo
 from wildgs.data.landmarks import MAX_IMAGE_SIZE, Landmarks, match_landmarks
 from wildgs.data.mapping import quiet
 from wildgs.data.scene import Alignment
 from wildgs.data.undistort import PixelGrid, sample_colors
+from wildgs.data.upright import save_jpeg
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 
@@ -34,6 +36,9 @@ MAX_ERROR = 0.008
 
 REFINE_LENS = 60
 """Inliers from which the lens's distortion is estimated too."""
+
+EXIF_SIDE = 256
+"""Pixels of the picture that carries an EXIF block: focal lengths are relative to the sides."""
 
 FOCAL_RANGE = (0.3, 30.0)
 """Focal lengths of photographs, relative to the long side; a pose that needs another is wrong."""
@@ -113,13 +118,20 @@ def localize(
 
 
 def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
-    """A camera with the EXIF block's focal length where it has one, and whether it has."""
+    """A camera with the EXIF block's focal length where it has one, and whether it has.
+
+    COLMAP (in C++, in the trainer's own process where a viewer asks) sees no byte of the file: only the entries
+    that Pillow could read, written anew beside a small empty picture of the same shape.
+    """
     try:
-        with quiet():
-            read = pycolmap.infer_camera_from_image(file)
+        with tempfile.TemporaryDirectory() as folder, open_image(file) as image, quiet():
+            blank = Image.new("RGB", (width, height))
+            blank.thumbnail((EXIF_SIDE, EXIF_SIDE))
+            save_jpeg(blank, image, Path(folder) / "exif.jpg")
+            read = pycolmap.infer_camera_from_image(Path(folder) / "exif.jpg")
         known = bool(read.has_prior_focal_length)
         focal = read.mean_focal_length() / max(read.width, read.height)
-    except Exception:  # COLMAP cannot read every format that Pillow can
+    except Exception:  # no EXIF block that makes sense
         known, focal = False, 1.2
     long_side = max(width, height)
     camera = pycolmap.Camera(

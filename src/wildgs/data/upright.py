@@ -14,7 +14,6 @@ from PIL import Image
 from wildgs.data.images import (
     EXIF_ORIENTATION,
     MAX_IMAGE_PIXELS,
-    Photo,
     UnreadableImageError,
     open_image,
     read_photo,
@@ -146,7 +145,7 @@ def _copy_one(
         if image.format == "JPEG" and image.mode == "RGB" and _orientation(image) == 1:
             shutil.copyfile(source, target)  # as it is: encoding it again would lose a little
             return False, position
-        _save_jpeg(photo, image, target)
+        save_jpeg(Image.fromarray(photo.pixels), image, target)
     if photo.opaque is None or photo.opaque.all():
         return False, position
     masks_dir.mkdir(parents=True, exist_ok=True)
@@ -173,8 +172,8 @@ def gps_position(image: Image.Image) -> tuple[float, float] | None:
     return (latitude, longitude) if sensible else None
 
 
-def _save_jpeg(photo: Photo, original: Image.Image, target: Path) -> None:
-    picture = Image.fromarray(photo.pixels)
+def save_jpeg(picture: Image.Image, original: Image.Image, target: Path) -> None:
+    """Write an upright picture with the entries of another one's EXIF block that can be read."""
     try:
         exif = original.getexif()
         for block in (EXIF_IFD, GPS_IFD):
