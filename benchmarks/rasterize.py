@@ -115,14 +115,14 @@ def peak_seconds_per_block(fmas: int) -> float:
 
 
 @njit(nogil=True, cache=True)
-def count_blocks(offsets, ids, records, tiles_x):
+def count_blocks(offsets, entries, records, tiles_x):
     """Blocks of 16 pixels that Gaussians reach."""
     total = 0
     for tile in range(offsets.size - 1):
         x = np.float32(tile % tiles_x * 16) + HALF
         y = np.float32(tile // tiles_x * 16) + HALF
         for p in range(offsets[tile], offsets[tile + 1]):
-            r = ids[p] * RECORD
+            r = entries[2 * p] * RECORD
             total += count_bits(
                 reach(
                     x - records[r], y - records[r + 1], np.float32(4.0), records[r + 2], records[r + 3],
@@ -178,8 +178,8 @@ def measure(backend: BackendName, n: int, width: int, height: int, runs: int) ->
 def add_rates(row: Row, projection: Projection) -> None:
     """What the CPU kernels did, and how that compares with the machine's peak."""
     tiles = projection.tiles
-    blocks = count_blocks(tiles.offsets, tiles.ids, tiles.records, -(-row.width // 16))
-    row.tile_pairs, row.pixel_gaussians = int(tiles.ids.size), 16 * blocks
+    blocks = count_blocks(tiles.offsets, tiles.entries, tiles.records, -(-row.width // 16))
+    row.tile_pairs, row.pixel_gaussians = tiles.pairs, 16 * blocks
     row.forward_per_second = row.pixel_gaussians / row.forward_ms * 1e3
     row.backward_per_second = row.pixel_gaussians / row.backward_ms * 1e3
     row.share_of_peak_forward = (

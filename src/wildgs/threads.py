@@ -81,6 +81,15 @@ def run_once(kernel: Callable[..., Any], *arguments: Any) -> Any:
     return announce_compilation(kernel, *arguments)
 
 
+def begin(kernel: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """Starts a kernel on one thread, beside what the caller does next; what it returns waits for the result."""
+    workers = thread_count()
+    if workers == 1 or not getattr(kernel, "signatures", True):
+        result = run_once(kernel, *arguments)
+        return lambda: result
+    return _pool(os.getpid(), workers - 1).submit(kernel, *arguments).result
+
+
 def flat(tensor: Tensor) -> np.ndarray:
     """A tensor's numbers as kernels take them: one axis, contiguous, no gradient."""
     return tensor.detach().contiguous().numpy().reshape(-1)

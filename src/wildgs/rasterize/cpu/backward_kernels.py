@@ -79,7 +79,7 @@ def load_tile(
 
 @njit(nogil=True, cache=True)
 def blend_backward(
-    counter, tile_order, offsets, ids, slots, records, values, channels, with_depth, background,
+    counter, tile_order, offsets, entries, records, values, channels, with_depth, background,
     width, height, final_transmittance, last, out_depth, out_alpha, v_colors, v_depth, v_alpha,
     row_size, rows, absgrad,
 ):  # fmt: skip
@@ -125,24 +125,24 @@ def blend_backward(
             farthest[block] = v[at : at + LANES].max()
             end = max(end, int(farthest[block]))
         for p in range(begin + end, offsets[tile + 1]):
-            at = slots[p] * row_size
+            at = np.int64(entries[2 * p + 1]) * row_size
             for k in range(row_size):
                 rows[at + k] = 0.0
         for stop in range(end, 0, -BATCH):
             start = max(stop - BATCH, 0)
             first = begin + start
-            load_batch(first, stop - start, ids, records, values, channels, tx, ty, batch)
+            load_batch(first, stop - start, entries, records, values, channels, tx, ty, batch)
             for i in range(stop - start):
-                prefetch_to_write(rows, slots[first + i] * row_size)
+                prefetch_to_write(rows, np.int64(entries[2 * (first + i) + 1]) * row_size)
                 masks[i] = mask_bits(vload(farthest, 0) >= np.float32(start + i + 1)) & reach(
                     batch[X + i], batch[Y + i], np.float32(4.0), batch[QA + i], batch[QB + i], batch[QC + i],
                     batch[LEVEL + i], batch[Y_PER_X + i], batch[X_PER_Y + i],
                 )  # fmt: skip
             for i in range(stop - start - 1, -1, -1):
+                rank, slot = entries[2 * (first + i)], np.int64(entries[2 * (first + i) + 1])
                 gather_pair(
-                    i, np.float32(start + i + 1), masks[i], batch, channels, with_depth, values,
-                    ids[first + i], absgrad,
-                    stride, v, places, v_color, rows, slots[first + i] * row_size,
+                    i, np.float32(start + i + 1), masks[i], batch, channels, with_depth, values, rank, absgrad,
+                    stride, v, places, v_color, rows, slot * row_size,
                 )  # fmt: skip
 
 

@@ -61,10 +61,10 @@ class _Blend(torch.autograd.Function):
             torch.empty(n, channels),
         )
         absgrad = None if ctx.absgrad is None else flat(ctx.absgrad)
-        with scratch("rows", tiles.ids.size * stride, np.float32) as rows:
+        with scratch("rows", tiles.pairs * stride, np.float32) as rows:
             launch(
                 backward_kernels.blend_backward,
-                tiles.tile_order, tiles.offsets, tiles.ids, tiles.slots, tiles.records,
+                tiles.tile_order, tiles.offsets, tiles.entries, tiles.records,
                 _rank_values(tiles, depths, colors), channels, ctx.with_depth, flat(background),
                 ctx.camera.width, ctx.camera.height, ctx.transmittance, ctx.last, flat(out_depth), flat(out_alpha),
                 flat(v_colors), flat(v_depth), flat(v_alpha), stride, rows, absgrad is not None,
@@ -121,7 +121,7 @@ def _blend_pictures(
     last = np.empty(size, np.float32) if bookkeeping else None
     launch(
         forward_kernels.blend_forward,
-        tiles.tile_order, tiles.offsets, tiles.ids, tiles.records,
+        tiles.tile_order, tiles.offsets, tiles.entries, tiles.records,
         values, channels, with_depth, flat(background),
         width, height, flat(out_colors), flat(out_depth), flat(out_alpha), transmittance, last,
     )  # fmt: skip

@@ -43,7 +43,7 @@ MIN_TRANSMITTANCE = np.float32(1e-4)
 
 
 @njit(nogil=True, cache=True)
-def load_batch(begin, count, ids, records, values, channels, tx, ty, batch):
+def load_batch(begin, count, entries, records, values, channels, tx, ty, batch):
     """Copies the numbers of `count` Gaussians of a tile's list into rows of BATCH floats (see X to BLUE).
 
     They lie scattered in memory: they are asked for ahead of time.
@@ -51,10 +51,11 @@ def load_batch(begin, count, ids, records, values, channels, tx, ty, batch):
     origin_x, origin_y = np.float32(tx * TILE) + HALF, np.float32(ty * TILE) + HALF
     row = channels + 1
     for i in range(count):
-        soon = ids[min(begin + i + AHEAD, ids.size - 1)]
+        soon = entries[min(2 * (begin + i + AHEAD), entries.size - 2)]
         prefetch(records, soon * RECORD)
         prefetch(values, soon * row)
-        r, v = ids[begin + i] * RECORD, ids[begin + i] * row
+        rank = entries[2 * (begin + i)]
+        r, v = rank * RECORD, rank * row
         batch[X + i] = origin_x - records[r]
         batch[Y + i] = origin_y - records[r + 1]
         batch[QA + i], batch[QB + i], batch[QC + i] = (
@@ -101,7 +102,7 @@ def reach_by_block(count, batch, words):
 
 @njit(nogil=True, cache=True)
 def blend_forward(
-    counter, tile_order, offsets, ids, records, values, channels, with_depth, background,
+    counter, tile_order, offsets, entries, records, values, channels, with_depth, background,
     width, height, out_colors, out_depth, out_alpha, final_transmittance, last,
 ):  # fmt: skip
     """Blends all tiles.
@@ -133,7 +134,7 @@ def blend_forward(
             if alive == 0:
                 break
             count = min(BATCH, end - start)
-            load_batch(start, count, ids, records, values, channels, tx, ty, batch)
+            load_batch(start, count, entries, records, values, channels, tx, ty, batch)
             reach_by_block(count, batch, words)
             for block in range(16):
                 word = words[block]
@@ -173,7 +174,7 @@ def blend_forward(
                         green = fma(weight, batch[GREEN + i], green)
                         blue = fma(weight, batch[BLUE + i], blue)
                     else:
-                        first = (channels + 1) * ids[start + i] + 1
+                        first = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
                             to = at + (k + 3) * LANES
                             vstore(

@@ -10,12 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.cpu import project_backward_kernels, project_kernels, tile_kernels
 from wildgs.rasterize.cpu.reach_kernels import RECORD, TILE
 from wildgs.rasterize.cpu.scratch import scratch
 from wildgs.rasterize.interface import Projection
-from wildgs.threads import flat, launch, run_once, thread_count
+from wildgs.threads import begin, flat, launch, run_once, thread_count
 
 GROUP = project_kernels.GROUP
 
@@ -31,9 +32,9 @@ class TileLists:
         homes: Each rank's Gaussian.
         records: Per rank what blending reads, eight floats (see `reach_kernels.RECORD`).
         starts: First slot of each rank's (tile, Gaussian) pairs, and the number of pairs.
-        offsets: Where each tile's list starts in `ids`; one more than there are tiles.
-        ids: Ranks, tile by tile, nearest first.
-        slots: Of each entry of `ids`: its slot among the rank's pairs.
+        offsets: Where each tile's list starts in `entries` (pairs); one more than there are tiles.
+        entries: Tile by tile, nearest first, two numbers: a rank, and the pair's slot among all ranks' pairs. They
+            lie together since they are written to places all over memory.
         tile_order: Tiles with long lists first, so that threads end together.
     """
 
@@ -42,9 +43,13 @@ class TileLists:
     records: np.ndarray
     starts: np.ndarray
     offsets: np.ndarray
-    ids: np.ndarray
-    slots: np.ndarray
+    entries: np.ndarray
     tile_order: np.ndarray
+
+    @property
+    def pairs(self) -> int:
+        """Number of (tile, Gaussian) pairs."""
+        return self.entries.size // 2
 
 
 @dataclass(frozen=True)
@@ -191,22 +196,28 @@ def _list_tiles(
         scratch("spans", 4 * seen, np.int32) as spans,
         scratch("keys", 2 * seen, np.uint32) as keys,
         scratch("order", 2 * seen, np.int32) as order,
+        scratch("nearest", seen, np.int32) as nearest,
     ):
         cursors = counts.reshape(chunks, -1)
         launch(tile_kernels.count_homes, tile_counts, boxes, tiles_x, cursors, items=chunks)
         run_once(tile_kernels.place_chunks, cursors, offsets)
+        ordered = begin(
+            tile_kernels.sort_by_depth,
+            depths, tile_counts, keys[:seen], order[:seen], keys[seen:], order[seen:],
+        )  # fmt: skip
         launch(
             tile_kernels.move_home,
             tile_counts, boxes, masks, records, tiles_x, cursors, ranks, homes, ranked_records, spans,
             items=chunks,
         )  # fmt: skip
         pairs = run_once(tile_kernels.number_slots, spans, starts)
-        order = run_once(
-            tile_kernels.sort_by_depth, depths, ranks, keys[:seen], order[:seen], keys[seen:], order[seen:]
-        )  # fmt: skip
+        if pairs >= 2**31:
+            raise UserError(f"{pairs:,} pairs of tile and Gaussian are too many; render a smaller picture")
         launch(
             tile_kernels.count_pairs,
-            order,
+            ordered(),
+            ranks,
+            nearest,
             spans,
             ranked_records,
             tiles_x,
@@ -214,11 +225,18 @@ def _list_tiles(
             items=chunks,
         )
         run_once(tile_kernels.place_chunks, cursors, offsets)
-        ids, slots = np.empty(pairs, np.int32), np.empty(pairs, np.int64)
+        entries = np.empty(2 * pairs, np.int32)
         launch(
-            tile_kernels.write_pairs, order, spans, ranked_records, starts, tiles_x, cursors, ids, slots,
+            tile_kernels.write_pairs,
+            nearest,
+            spans,
+            ranked_records,
+            starts,
+            tiles_x,
+            cursors,
+            entries,
             items=chunks,
-        )  # fmt: skip
+        )
     # By powers of two of the length: within one, neighbouring tiles follow each other and share the cache.
     tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
-    return TileLists(ranks, homes, ranked_records, starts, offsets, ids, slots, tile_order)
+    return TileLists(ranks, homes, ranked_records, starts, offsets, entries, tile_order)

@@ -108,8 +108,8 @@ def number_slots(spans, starts):
 
 
 @njit(nogil=True, cache=True)
-def sort_by_depth(depths, ranks, keys, order, other_keys, other_order):
-    """Ranks nearest first, those at the same depth in the Gaussians' own order; in the array that is returned.
+def sort_by_depth(depths, tile_counts, keys, order, other_keys, other_order):
+    """Gaussians that reach tiles, nearest first, at the same depth in their own order; in the array it returns.
 
     A radix sort of the bits of the positive depths less their minimum, so that a scene whose depths lie within a
     few octaves takes two or three passes.
@@ -118,10 +118,10 @@ def sort_by_depth(depths, ranks, keys, order, other_keys, other_order):
     low, high = np.uint32(0xFFFFFFFF), np.uint32(0)
     seen = 0
     for g in range(depths.size):
-        if ranks[g] >= 0:
+        if tile_counts[g] > 0:
             key = bits[g]
             keys[seen] = key
-            order[seen] = ranks[g]
+            order[seen] = g
             seen += 1
             low = min(low, key)
             high = max(high, key)
@@ -156,8 +156,8 @@ def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
 
 
 @njit(nogil=True, cache=True)
-def count_pairs(counter, order, spans, records, tiles_x, cursors):
-    """Pairs per (chunk of the depth order, tile), into `cursors`."""
+def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors):
+    """Pairs per (chunk of the depth order, tile), into `cursors`; the order as ranks, into `nearest`."""
     chunks, count = cursors.shape[0], order.size
     while True:
         chunk = fetch_add(counter, 1)
@@ -166,8 +166,10 @@ def count_pairs(counter, order, spans, records, tiles_x, cursors):
         row = cursors[chunk]
         row[:] = 0
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
-            prefetch(spans, 4 * order[min(i + AHEAD, count - 1)])
-            rank = order[i]
+            prefetch(ranks, order[min(i + 2 * AHEAD, count - 1)])
+            prefetch(spans, 4 * ranks[order[min(i + AHEAD, count - 1)]])
+            rank = ranks[order[i]]
+            nearest[i] = rank
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
             bits = int(spans[4 * rank + 2])
             if bits >= 0:
@@ -188,19 +190,19 @@ def count_pairs(counter, order, spans, records, tiles_x, cursors):
 
 
 @njit(nogil=True, cache=True)
-def write_pairs(counter, order, spans, records, starts, tiles_x, cursors, ids, slots):
-    """Writes each pair's rank and its slot among that rank's pairs, tile by tile, nearest first."""
-    chunks, count = cursors.shape[0], order.size
+def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entries):
+    """Writes each pair's rank and slot, tile by tile, nearest first."""
+    chunks, count = cursors.shape[0], nearest.size
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= chunks:
             break
         row = cursors[chunk]
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
-            soon = order[min(i + AHEAD, count - 1)]
+            soon = nearest[min(i + AHEAD, count - 1)]
             prefetch(spans, 4 * soon)
             prefetch(starts, soon)
-            rank = order[i]
+            rank = nearest[i]
             slot = starts[rank]
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
             x1, y1 = spans[4 * rank + 1] & 0xFFFF, spans[4 * rank + 1] >> 16
@@ -216,8 +218,8 @@ def write_pairs(counter, order, spans, records, starts, tiles_x, cursors, ids, s
                         tile = (ty + (b >> 2)) * tiles_x + tx + (b & 3)
                         at = row[tile]
                         row[tile] = at + 1
-                        ids[at] = rank
-                        slots[at] = slot
+                        entries[2 * at] = rank
+                        entries[2 * at + 1] = slot
                         slot += 1
 
 
