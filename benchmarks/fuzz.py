@@ -62,6 +62,7 @@ class Reader:
 
 
 def _model(folder: Path, kind: str) -> list[str]:
+    """A small model whose tracks agree with its images, or COLMAP would refuse it undamaged."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(12, 3)) + [0, 0, 4]
     names = ["a.png", "sub/b c.png", "ü.png"]
@@ -69,9 +70,12 @@ def _model(folder: Path, kind: str) -> list[str]:
     if kind == "txt":
         cameras = "# x\n1 PINHOLE 24 16 20 20 12 8\n2 OPENCV 24 16 20 20 12 8 0.1 0 0 0\n"
         images = "".join(
-            f"{i + 1} 1 0 0 0 0.{i} 0 0 {1 + i % 2} {n}\n1.0 2.0 0\n" for i, n in enumerate(names)
+            f"{i + 1} 1 0 0 0 0.{i} 0 0 {1 + i % 2} {n}\n"
+            + " ".join(f"{k}.5 2.0 {k if i < 2 else -1}" for k in range(len(points)))
+            + "\n"
+            for i, n in enumerate(names)
         )
-        rows = "".join(f"{i} {x} {y} {z} 9 8 7 0.5 1 0 2 0\n" for i, (x, y, z) in enumerate(points))
+        rows = "".join(f"{i} {x} {y} {z} 9 8 7 0.5 1 {i} 2 {i}\n" for i, (x, y, z) in enumerate(points))
         content = [cameras.encode(), images.encode(), rows.encode()]
     else:
         cameras = struct.pack("<QIiQQ4d", 2, 1, 1, 24, 16, 20, 20, 12, 8)
@@ -79,10 +83,14 @@ def _model(folder: Path, kind: str) -> list[str]:
         images = struct.pack("<Q", len(names))
         for index, name in enumerate(names):
             images += struct.pack("<I7dI", index + 1, 1, 0, 0, 0, 0.1 * index, 0, 0, 1 + index % 2)
-            images += name.encode() + b"\0" + struct.pack("<Q2dQ", 1, 1.0, 2.0, 0)
+            images += name.encode() + b"\0" + struct.pack("<Q", len(points))
+            for k in range(len(points)):
+                images += struct.pack("<2dQ", k + 0.5, 2.0, k if index < 2 else 2**64 - 1)
         rows = struct.pack("<Q", len(points))
         for index, point in enumerate(points):
-            rows += struct.pack("<Q3d3Bd", index, *point, 9, 8, 7, 0.5) + struct.pack("<QIIII", 2, 1, 0, 2, 0)
+            rows += struct.pack("<Q3d3Bd", index, *point, 9, 8, 7, 0.5) + struct.pack(
+                "<QIIII", 2, 1, index, 2, index
+            )
         content = [cameras, images, rows]
     files = [f"{name}.{kind}" for name in ("cameras", "images", "points3D")]
     for name, data in zip(files, content, strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,6 +63,20 @@ def denormals_kept() -> Iterator[None]:
 def shared() -> Path:
     """The folder with real photos and scenes; tests that use it carry the marker `shared`."""
     return SHARED
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of four megabytes."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(disk)]
+    try:
+        subprocess.run(command, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("may not mount a file system here; injected failures stand in for it elsewhere")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
 
 
 TRAIN = (

@@ -147,6 +147,25 @@ def test_a_folder_that_cannot_be_written_is_said(landmark: Path, tmp_path: Path,
     assert "cannot be written" in capsys.readouterr().err
 
 
+def test_a_disk_that_fills_up_costs_no_checkpoint_and_no_step(
+    undisturbed: Path, landmark: Path, small_disk: Path, wildgs, capsys
+) -> None:
+    """A real file system without room for the last checkpoint; then somebody makes room."""
+    size = list_checkpoints(undisturbed / "checkpoints")[0].stat().st_size
+    (small_disk / "filler").write_bytes(bytes(4 * 2**20 - int(1.6 * size)))
+    run = small_disk / "run"
+    assert wildgs("train", landmark, "--output", run, *TRAIN) == 2
+    errors = capsys.readouterr().err
+    assert "step_00000024.safetensors cannot be written" in errors
+    assert "make room, then --resume" in errors.splitlines()[-1]
+    kept = list_checkpoints(run / "checkpoints")
+    assert 0 < load_checkpoint(kept[-1]).state["progress.step"] < 24
+    assert sorted((run / "checkpoints").iterdir()) == kept  # nothing half
+    (small_disk / "filler").unlink()
+    assert wildgs("train", landmark, "--output", run, "--resume") == 0
+    assert fingerprint(run) == fingerprint(undisturbed)
+
+
 def test_signals_in_other_threads_are_left_alone() -> None:
     import threading
 

@@ -132,8 +132,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         header = json.loads(metadata["wildgs"])
         if not isinstance(header, dict):
             raise ValueError("its header is no mapping")
-        # Files of the first version carry no checksum.
-        if "sha256" in metadata and metadata["sha256"] != _digest(state, metadata["wildgs"]):
+        if "sha256" not in metadata:  # damage may hit the checksum's own name
+            raise ValueError("it has no checksum")
+        if metadata["sha256"] != _digest(state, metadata["wildgs"]):
             raise ValueError("its checksum does not match")
     except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
         raise UserError(f"{path} is not a readable checkpoint ({error}); use another one") from error
