@@ -88,9 +88,8 @@ def _model(folder: Path, kind: str) -> list[str]:
                 images += struct.pack("<2dQ", k + 0.5, 2.0, k if index < 2 else 2**64 - 1)
         rows = struct.pack("<Q", len(points))
         for index, point in enumerate(points):
-            rows += struct.pack("<Q3d3Bd", index, *point, 9, 8, 7, 0.5) + struct.pack(
-                "<QIIII", 2, 1, index, 2, index
-            )
+            rows += struct.pack("<Q3d3Bd", index, *point, 9, 8, 7, 0.5)
+            rows += struct.pack("<QIIII", 2, 1, index, 2, index)
         content = [cameras, images, rows]
     files = [f"{name}.{kind}" for name in ("cameras", "images", "points3D")]
     for name, data in zip(files, content, strict=True):

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safetensors.torch import save_file
 
 from wildgs.engine import checkpoint as module
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
@@ -111,10 +110,11 @@ def test_all_damaged_is_a_users_mistake_and_none_is_none(tmp_path: Path) -> None
         load_newest(tmp_path)
 
 
-def test_files_of_the_first_version_are_read(tmp_path: Path) -> None:
+def test_damage_to_the_checksums_own_name_is_seen(whole: bytes, tmp_path: Path) -> None:
     path = tmp_path / "step_00000001.safetensors"
-    save_file({"x": STATE["x"]}, path, metadata={"wildgs": "{}"})
-    assert torch.equal(load_checkpoint(path).state["x"], STATE["x"])
+    path.write_bytes(whole.replace(b"sha256", b"sha257").replace(b'"x"', b'"y"'))
+    with pytest.raises(UserError, match="no checksum"):
+        load_checkpoint(path)
 
 
 def test_what_a_killed_writer_left_is_cleared(tmp_path: Path) -> None:

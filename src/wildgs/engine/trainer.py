@@ -298,8 +298,7 @@ class Trainer:
             warnings.warn(f"{message}; it goes on with these", WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
-        if "random.torch" in state:  # files of the first version lack it
-            torch.set_rng_state(state["random.torch"])
+        torch.set_rng_state(state["random.torch"])
         if "random.cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["random.cuda"], self.device)
         self.step = int(state["progress.step"])
