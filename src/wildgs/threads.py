@@ -71,7 +71,8 @@ def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = Non
     pending = [helpers.submit(kernel, counter, *arguments) for _ in range(workers - 1)]
     kernel(counter, *arguments)
     for job in pending:
-        job.result()
+        if not job.cancel():  # one that has not begun by now would find nothing left to do
+            job.result()
 
 
 def run_once(kernel: Callable[..., Any], *arguments: Any) -> Any:

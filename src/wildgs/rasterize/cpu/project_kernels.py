@@ -47,8 +47,8 @@ def project_forward(
 ):  # fmt: skip
     """Projects all Gaussians: centres, depths, conics, radii, blending records and the tiles that they reach.
 
-    A Gaussian's tiles lie in its box (first and last tile, inclusive); where the box is at most 4 x 4 tiles, its
-    mask has a bit per tile that is reached, else it is -1.
+    A Gaussian's tiles lie in its box (first and last tile, inclusive; packed by `pack_box`); where the box is at
+    most 4 x 4 tiles, its mask has a bit per tile that is reached, else it is -1.
     """
     n = depths.size
     groups = (n + GROUP - 1) // GROUP
@@ -63,35 +63,42 @@ def project_forward(
                 i, means, quats, scales, opacities, view, lens, width, height, near,
                 means2d, depths, conics, records, spans,
             )  # fmt: skip
+            nn, fn, nf, ff, small = corners
             for lane in range(GROUP):
                 g = i + lane
-                radii[g] = np.int32(spans[lane])
-                tile_counts[g] = 0
-                if radii[g] > 0:
-                    tile_counts[g] = find_tiles(g, lane, spans, corners, records, boxes, masks)
+                radius = np.int32(spans[lane])
+                radii[g] = radius
+                mask, count = 0, 0
+                if radius > 0:
+                    x0, y0 = int(spans[GROUP + lane]), int(spans[2 * GROUP + lane])
+                    x1, y1 = int(spans[3 * GROUP + lane]), int(spans[4 * GROUP + lane])
+                    boxes[g] = pack_box(x0, y0, x1, y1)
+                    if (small >> lane) & 1 != 0:
+                        a, b, c, d = (nn >> lane) & 1, (fn >> lane) & 1, (nf >> lane) & 1, (ff >> lane) & 1
+                        mask, count = a | (b << 1) | (c << 4) | (d << 5), a + b + c + d
+                    else:
+                        mask, count = find_tiles(g, x0, y0, x1, y1, records)
+                masks[g] = mask
+                tile_counts[g] = count
 
 
 @njit(nogil=True, cache=True, inline="always")
-def find_tiles(g, lane, spans, corners, records, boxes, masks):
-    """Writes a Gaussian's box and mask; returns how many tiles it reaches."""
-    x0, y0 = int(spans[GROUP + lane]), int(spans[2 * GROUP + lane])
-    x1, y1 = int(spans[3 * GROUP + lane]), int(spans[4 * GROUP + lane])
-    boxes[4 * g], boxes[4 * g + 1], boxes[4 * g + 2], boxes[4 * g + 3] = x0, y0, x1, y1
-    if x1 - x0 < 2 and y1 - y0 < 2:
-        nn, fn = (corners[0] >> lane) & 1, (corners[1] >> lane) & 1
-        nf, ff = (corners[2] >> lane) & 1, (corners[3] >> lane) & 1
-        masks[g] = nn | (fn << 1) | (nf << 4) | (ff << 5)
-        return nn + fn + nf + ff
+def pack_box(x0, y0, x1, y1):
+    """First and last column and row of tiles in one number, so that it is moved at once."""
+    return x0 | (y0 << 16) | (x1 << 32) | (y1 << 48)
+
+
+@njit(nogil=True, cache=True)
+def find_tiles(g, x0, y0, x1, y1, records):
+    """A Gaussian's mask, and how many tiles it reaches."""
     if x1 - x0 < 4 and y1 - y0 < 4:
         mask = window_mask(g, records, x0, y0) & inside_bits(x0, y0, x1, y1)
-        masks[g] = mask
-        return count_bits(mask)
-    masks[g] = -1
+        return mask, count_bits(mask)
     count = 0
     for ty in range(y0, y1 + 1, 4):
         for tx in range(x0, x1 + 1, 4):
             count += count_bits(window_mask(g, records, tx, ty) & inside_bits(tx, ty, x1, y1))
-    return count
+    return -1, count
 
 
 @njit(nogil=True, cache=True)
@@ -101,7 +108,8 @@ def project_group(
     """Sixteen Gaussians from index i.
 
     `spans` takes radii and the boxes' first and last tiles. Returns, for the box's first tile, the one to its
-    right, the one below and the one beyond both, a bit per Gaussian that reaches it.
+    right, the one below and the one beyond both, a bit per Gaussian that reaches it; and a bit per Gaussian whose
+    box has no more tiles than these.
     """
     R = camera_numbers(view)
     px, py, pz = vload3(means, 3 * i)
@@ -144,7 +152,7 @@ def project_group(
     radius = vmin(-vfloor(-vmax(hx, hy)), 1e9)
     vstore(spans, 0, select(seen, vmax(radius, 1.0), zero))
     if mask_bits(seen) == 0:
-        return 0, 0, 0, 0
+        return 0, 0, 0, 0, 0
     A, B, C = -0.5 * LOG2_E * conic_a, -LOG2_E * conic_b, -0.5 * LOG2_E * conic_c
     y_per_x, x_per_y = b / a, b / c
     vstore8(records, RECORD * i, (mx, my, A, B, C, level, y_per_x, x_per_y))
@@ -181,4 +189,5 @@ def project_group(
         mask_bits(wide & (fn >= floor)),
         mask_bits(tall & (nf >= floor)),
         mask_bits(wide & tall & (ff >= floor)),
+        mask_bits(seen & (x1 - x0 < 2.0) & (y1 - y0 < 2.0)),
     )

@@ -143,7 +143,7 @@ def project(
     tile_counts = np.empty(count, np.int32)
     with (
         scratch("records", count * RECORD, np.float32) as records,
-        scratch("boxes", 4 * count, np.int16) as boxes,
+        scratch("boxes", count, np.int64) as boxes,
         scratch("masks", count, np.int32) as masks,
     ):
         launch(
@@ -210,33 +210,20 @@ def _list_tiles(
             tile_counts, boxes, masks, records, tiles_x, cursors, ranks, homes, ranked_records, spans,
             items=chunks,
         )  # fmt: skip
-        pairs = run_once(tile_kernels.number_slots, spans, starts)
+        numbered = begin(tile_kernels.number_slots, spans, starts)
+        launch(
+            tile_kernels.count_pairs, ordered(), ranks, nearest, spans, ranked_records, tiles_x, cursors,
+            items=chunks,
+        )  # fmt: skip
+        run_once(tile_kernels.place_chunks, cursors, offsets)
+        pairs = numbered()
         if pairs >= 2**31:
             raise UserError(f"{pairs:,} pairs of tile and Gaussian are too many; render a smaller picture")
-        launch(
-            tile_kernels.count_pairs,
-            ordered(),
-            ranks,
-            nearest,
-            spans,
-            ranked_records,
-            tiles_x,
-            cursors,
-            items=chunks,
-        )
-        run_once(tile_kernels.place_chunks, cursors, offsets)
         entries = np.empty(2 * pairs, np.int32)
         launch(
-            tile_kernels.write_pairs,
-            nearest,
-            spans,
-            ranked_records,
-            starts,
-            tiles_x,
-            cursors,
-            entries,
+            tile_kernels.write_pairs, nearest, spans, ranked_records, starts, tiles_x, cursors, entries,
             items=chunks,
-        )
+        )  # fmt: skip
     # By powers of two of the length: within one, neighbouring tiles follow each other and share the cache.
     tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
     return TileLists(ranks, homes, ranked_records, starts, offsets, entries, tile_order)

@@ -22,6 +22,12 @@ AHEAD = 16  # items between asking for what an item needs and using it
 DIGIT = 12  # bits per radix pass, so that the counts stay in the fastest cache
 
 
+@njit(nogil=True, cache=True, inline="always")
+def home_tile(box, tiles_x):
+    """The tile in which a box (see `project_kernels.pack_box`) starts."""
+    return ((box >> 16) & 0xFFFF) * tiles_x + (box & 0xFFFF)
+
+
 @njit(nogil=True, cache=True)
 def count_homes(counter, tile_counts, boxes, tiles_x, cursors):
     """Gaussians that reach tiles per (chunk, home tile), into `cursors`."""
@@ -34,7 +40,7 @@ def count_homes(counter, tile_counts, boxes, tiles_x, cursors):
         row[:] = 0
         for g in range(chunk * n // chunks, (chunk + 1) * n // chunks):
             if tile_counts[g] > 0:
-                row[boxes[4 * g + 1] * tiles_x + boxes[4 * g]] += 1
+                row[home_tile(boxes[g], tiles_x)] += 1
 
 
 @njit(nogil=True, cache=True)
@@ -77,7 +83,7 @@ def move_home(
             for g in range(first, min(first + AHEAD, end)):
                 ranks[g] = -1
                 if tile_counts[g] > 0:
-                    tile = boxes[4 * g + 1] * tiles_x + boxes[4 * g]
+                    tile = home_tile(boxes[g], tiles_x)
                     rank = row[tile]
                     row[tile] = rank + 1
                     ranks[g] = rank
@@ -90,8 +96,7 @@ def move_home(
                     homes[rank] = g
                     for k in range(RECORD):
                         ranked_records[RECORD * rank + k] = records[RECORD * g + k]
-                    spans[4 * rank] = np.int32(boxes[4 * g]) | (np.int32(boxes[4 * g + 1]) << 16)
-                    spans[4 * rank + 1] = np.int32(boxes[4 * g + 2]) | (np.int32(boxes[4 * g + 3]) << 16)
+                    spans[4 * rank], spans[4 * rank + 1] = np.int32(boxes[g]), np.int32(boxes[g] >> 32)
                     spans[4 * rank + 2] = masks[g]
                     spans[4 * rank + 3] = tile_counts[g]
 
@@ -205,22 +210,30 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
             rank = nearest[i]
             slot = starts[rank]
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
+            bits = int(spans[4 * rank + 2])
+            if bits >= 0:
+                write_window(bits, y0 * tiles_x + x0, tiles_x, rank, slot, row, entries)
+                continue
             x1, y1 = spans[4 * rank + 1] & 0xFFFF, spans[4 * rank + 1] >> 16
-            mask = int(spans[4 * rank + 2])
             for ty in range(y0, y1 + 1, 4):
                 for tx in range(x0, x1 + 1, 4):
-                    bits = mask
-                    if mask < 0:
-                        bits = window_mask(rank, records, tx, ty) & inside_bits(tx, ty, x1, y1)
-                    while bits != 0:
-                        b = lowest_bit(bits)
-                        bits &= bits - 1
-                        tile = (ty + (b >> 2)) * tiles_x + tx + (b & 3)
-                        at = row[tile]
-                        row[tile] = at + 1
-                        entries[2 * at] = rank
-                        entries[2 * at + 1] = slot
-                        slot += 1
+                    bits = window_mask(rank, records, tx, ty) & inside_bits(tx, ty, x1, y1)
+                    slot = write_window(bits, ty * tiles_x + tx, tiles_x, rank, slot, row, entries)
+
+
+@njit(nogil=True, cache=True, inline="always")
+def write_window(bits, first, tiles_x, rank, slot, row, entries):
+    """Writes a pair for each tile of a window of 4 x 4 whose bit is set; returns the next slot."""
+    while bits != 0:
+        b = lowest_bit(bits)
+        bits &= bits - 1
+        tile = first + (b >> 2) * tiles_x + (b & 3)
+        at = row[tile]
+        row[tile] = at + 1
+        entries[2 * at] = rank
+        entries[2 * at + 1] = slot
+        slot += 1
+    return slot
 
 
 @njit(nogil=True, cache=True)
@@ -232,6 +245,9 @@ def rank_values(counter, chunk_size, homes, depths, colors, channels, values):
         if first >= homes.size:
             break
         for rank in range(first, min(first + chunk_size, homes.size)):
+            soon = homes[min(rank + AHEAD, homes.size - 1)]
+            prefetch(depths, soon)
+            prefetch(colors, channels * soon)
             g = homes[rank]
             values[rank * row] = depths[g]
             for k in range(channels):
