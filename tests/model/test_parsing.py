@@ -11,6 +11,7 @@ from transformers import ResNetConfig, ResNetModel
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.encoder import FEATURE_WIDTHS, FrozenBatchNorm, load_encoder
 from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.precision import lay_out_channels_last, set_precision
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,23 @@ def test_mask_has_the_photos_size_and_starts_static(parsing: Parsing, size: tupl
     assert embedding.shape == (16,)
     assert (visibility > 0.5).all()
     assert (visibility < 1).all()
+
+
+@pytest.mark.parametrize("size", [(64, 42), (42, 64), (300, 7), (20, 20)])
+def test_narrow_photos_are_parsed_alike_in_bfloat16(parsing: Parsing, size: tuple[int, int]) -> None:
+    """A convolution to a map of width one gave what was left in memory; see `LEAST_SIDE`."""
+    photo = torch.rand(*size, 3)
+    set_precision(parsing, torch.bfloat16)
+    lay_out_channels_last(parsing)
+    try:
+        first = parsing(photo)
+        for _ in range(20):
+            left = [torch.full((count,), float("nan")) for count in (1_000, 5_000, 20_000, 100_000) * 3]
+            del left
+            for found, wanted in zip(parsing(photo), first, strict=True):
+                torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    finally:
+        set_precision(parsing, torch.float32)
 
 
 def test_same_photo_gives_the_same_in_training_and_evaluation(parsing: Parsing) -> None:

@@ -16,6 +16,10 @@ from wildgs.model.unet import LEAST_SPREAD, UpBlock, standardize_output
 
 CALIBRATION_SIDE = 224
 SIDE_STEP = 32
+LEAST_SIDE = 64
+"""Of what the encoder reads. From 32 pixels its deepest map would be one wide, where oneDNN's convolution in
+bfloat16 (3 x 3, stride 2, hundreds of channels; torch 2.13) reads memory that nobody wrote: NaN, or worse."""
+
 OPPONENTS = ((1 / 3, 1 / 3, 1 / 3), (0.5, -0.5, 0.0), (-0.25, -0.25, 0.5))
 """Brightness, red against green, blue against yellow: so that a colour cast is not lost beside brightness."""
 
@@ -148,9 +152,9 @@ class Parsing(MixedModule):
         """
         image = photo.permute(2, 0, 1)[None]
         factor = min(1.0, self.config.max_side / max(photo.shape[:2]))
-        most = max(SIDE_STEP, self.config.max_side // SIDE_STEP * SIDE_STEP)
+        most = max(LEAST_SIDE, self.config.max_side // SIDE_STEP * SIDE_STEP)
         height, width = (
-            min(most, max(SIDE_STEP, round(side * factor / SIDE_STEP) * SIDE_STEP))
+            min(most, max(LEAST_SIDE, round(side * factor / SIDE_STEP) * SIDE_STEP))
             for side in photo.shape[:2]
         )
         if (height, width) == tuple(photo.shape[:2]):
