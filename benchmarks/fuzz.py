@@ -10,6 +10,7 @@ Example: python benchmarks/fuzz.py --minutes 10
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import random
 import resource
@@ -231,6 +232,62 @@ def _read_checkpoints(folder: Path) -> object:
     return newest
 
 
+def _method() -> Any:
+    import torch
+
+    from wildgs.model.encoder import load_encoder
+    from wildgs.model.wildgs import WildGS, WildGSConfig
+    from wildgs.model.wrapping import WrappingConfig
+
+    torch.manual_seed(0)
+    config = WildGSConfig(wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)))
+    colors = torch.full((30, 3), 128, dtype=torch.uint8)
+    return WildGS.from_points(config, torch.rand(30, 3), colors, load_encoder(None)).eval()
+
+
+METHOD = functools.cache(_method)
+
+
+def _appearance(folder: Path) -> list[str]:
+    import torch
+
+    from wildgs.geometry.camera import Camera
+    from wildgs.light.look import look_of
+    from wildgs.light.saved import save_look
+
+    camera = Camera(torch.eye(4), 30 * torch.eye(3), 48, 32)
+    look = look_of(METHOD(), METHOD().encode(torch.rand(32, 48, 3), camera), "evening")
+    save_look(look, folder / "evening.safetensors")
+    return ["evening.safetensors"]
+
+
+def _read_appearance(folder: Path) -> object:
+    from wildgs.light.saved import load_look
+
+    return load_look(METHOD(), folder / "evening.safetensors")
+
+
+def _cameras(folder: Path) -> list[str]:
+    pose = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]"
+    ours = f'{{"viewmat": {pose}, "K": [[30, 0, 24], [0, 30, 16], [0, 0, 1]], "width": 48, "height": 32}}'
+    (folder / "ours.json").write_text(f'{{"frame": "scene", "fps": 24, "cameras": [{ours}, {ours}]}}')
+    theirs = f'{{"camera_to_world": {pose}, "fov": 50, "aspect": 1.5}}'
+    size = '"render_width": 48, "render_height": 32, "fps": 24'
+    (folder / "theirs.json").write_text(
+        f'{{{size}, "camera_type": "perspective", "camera_path": [{theirs}]}}'
+    )
+    (folder / "dataparser_transforms.json").write_text(
+        '{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2]], "scale": 0.5}'
+    )
+    return ["ours.json", "theirs.json", "dataparser_transforms.json"]
+
+
+def _read_cameras(folder: Path) -> object:
+    from wildgs.geometry.camera_file import read_camera_path
+
+    return read_camera_path(folder / "ours.json"), read_camera_path(folder / "theirs.json")
+
+
 READERS = {
     "COLMAP binary": Reader(_scene("bin"), _read_scene),
     "COLMAP text": Reader(_scene("txt"), _read_scene),
@@ -238,6 +295,8 @@ READERS = {
     "split": Reader(_split, _read_split),
     "config": Reader(_config, _read_config),
     "checkpoints": Reader(_checkpoints, _read_checkpoints),
+    "appearance": Reader(_appearance, _read_appearance),
+    "camera files": Reader(_cameras, _read_cameras),
 }
 PYCOLMAP = {
     "pycolmap binary": Reader(_scene("bin"), _read_pycolmap),

@@ -95,13 +95,13 @@ def work(options: argparse.Namespace, team: Team) -> None:
     scene: Scene = load_scene(options.folder / "scene", DataConfig(holdout=0))
     rows = []
     for method in options.methods:
-        trainer = make_trainer(method, scene, options.n, default_device(), WildGSConfig(), team)
+        trainer = make_trainer(method, scene, options.gaussians, default_device(), WildGSConfig(), team)
         step_ms = time_steps(trainer, options.steps)
         exchange_ms, megabytes = time_exchange(trainer, max(3, options.steps // 2))
         camera = scene.train_views[0].camera
         rows.append(
             Row(
-                method, str(trainer.device), options.n, camera.width, camera.height, team.size,
+                method, str(trainer.device), options.gaussians, camera.width, camera.height, team.size,
                 torch.get_num_threads(), step_ms, 1e3 * team.size / step_ms,
                 exchange_ms if team.size > 1 else 0.0, megabytes, peak_memory(trainer.device),
             )
@@ -116,7 +116,15 @@ def launch(options: argparse.Namespace, folder: Path, processes: int, threads: i
     launcher = [sys.executable]
     if processes > 1:
         launcher += ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-    arguments = [__file__, "--folder", str(folder), "--n", str(options.n), "--steps", str(options.steps)]
+    arguments = [
+        __file__,
+        "--folder",
+        str(folder),
+        "--gaussians",
+        str(options.gaussians),
+        "--steps",
+        str(options.steps),
+    ]
     arguments += ["--methods", *options.methods, "--threads", str(threads)]
     environment = os.environ | ({"WILDGS_NUM_THREADS": str(threads)} if threads else {})
     subprocess.run([*launcher, *arguments], env=environment, check=True, stdout=sys.stderr)
@@ -162,7 +170,7 @@ def main() -> None:
     methods: tuple[MethodName, ...] = ("3dgs", "wildgs")
     parser.add_argument("--processes", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--methods", nargs="+", choices=methods, default=list(methods))
-    parser.add_argument("--n", type=int, default=100_000, help="Gaussians")
+    parser.add_argument("--gaussians", type=int, default=100_000, help="Gaussians")
     parser.add_argument("--width", type=int, default=480, help="pixels of the longer side")
     parser.add_argument("--steps", type=int, default=12, help="timed steps")
     parser.add_argument("--json", action="store_true", help="only the rows, on stdout")

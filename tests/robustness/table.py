@@ -41,6 +41,7 @@ _MODEL: dict[str, Cell] = {
 }
 _BAD_MASK = ("error", r"masks.p02\.png.*mend the mask or remove it", "error: mend or remove it")
 _BAD_DEPTH = ("left out", r"depth.p02\.png.*trains without depth", "photo trains without depth")
+_NO_APPEARANCE = ("error", "is no appearance file", "error")
 _DAMAGED = ("left out", r"step_00000002\.safetensors is damaged", "the one before is used")
 
 TABLE: dict[str, dict[str, Cell]] = {
@@ -137,6 +138,34 @@ TABLE: dict[str, dict[str, Cell]] = {
         "read-only": ("error", "cannot be written", "error"),
         "full disk": ("error", "cannot be written .*make room", "error"),
         "link loop": ("error", "is not a run folder", "error"),
+    },
+    "appearance": {
+        "missing": ("error", "no such file", "error"),
+        "empty": _NO_APPEARANCE,
+        "truncated": _NO_APPEARANCE,
+        "wrong type": _NO_APPEARANCE,
+        "wrong size": _NO_APPEARANCE,
+        "NaN": _NO_APPEARANCE,
+        "huge": _NO_APPEARANCE,
+        "duplicate": None,
+        "names": ("used", "", "used"),
+        "read-only": ("error", "cannot be written", "error"),
+        "full disk": ("error", "cannot be written .*make room", "error"),
+        "link loop": ("error", "no such file", "error"),
+    },
+    "camera file": {
+        "missing": ("error", "no such file", "error"),
+        "empty": ("error", "cannot be read as JSON", "error"),
+        "truncated": ("error", "cannot be read as JSON", "error"),
+        "wrong type": ("error", "cannot be read as JSON", "error"),
+        "wrong size": ("error", r"cameras\[1\] needs 4 x 4 numbers", "error: names the camera"),
+        "NaN": ("error", r"cameras\[1\] needs 4 x 4 numbers", "error: names the camera"),
+        "huge": ("error", r"cameras\[1\]: width and height", "error: pictures over 32,768 a side"),
+        "duplicate": ("used", "", "used: the camera stands still"),
+        "names": ("used", "", "used"),
+        "read-only": ("error", "cannot be written", "error"),
+        "full disk": ("error", "cannot be written .*make room", "error"),
+        "link loop": ("error", "cannot be read as JSON", "error"),
     },
 }
 

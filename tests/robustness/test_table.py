@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import struct
@@ -15,12 +16,21 @@ import pytest
 import torch
 import yaml
 from PIL import Image
-from safetensors.torch import save_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from wildgs.config import RunConfig, write_config
 from wildgs.data import DataConfig, load_scene
 from wildgs.engine import checkpoint as checkpoint_module
+from wildgs.engine.checkpoint import load_checkpoint
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.camera_file import read_camera_path, write_camera_path
+from wildgs.light.look import look_of
+from wildgs.light.saved import load_look, save_look
+from wildgs.model.encoder import load_encoder
+from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.model.wrapping import WrappingConfig
 from wildgs.runs import load_run, save_run, start_training
 
 
@@ -292,12 +302,12 @@ def test_checkpoints(fault: str, run: Path, monkeypatch) -> None:
         newest.unlink()
     elif fault == "wrong size":
         means = {"method.gaussians.rows.means": torch.zeros(3, 7)}
-        save_file(state | means, newest, metadata={"wildgs": "{}"})
+        checkpoint_module.save_checkpoint(newest.parent, 2, state | means, {})
     elif fault == "NaN":
         means = {"method.gaussians.rows.means": torch.full((30, 3), float("nan"))}
-        header = load_header(newest)
         progress = {"progress.step": torch.tensor(2), "progress.seconds": torch.tensor(0.0)}
-        save_file(state | means | progress, newest, metadata={"wildgs": header})
+        header = load_checkpoint(newest).header
+        checkpoint_module.save_checkpoint(newest.parent, 2, state | means | progress, header)
     elif fault == "huge":
         newest.write_bytes(struct.pack("<Q", 2**60) + newest.read_bytes()[8:])
     elif fault in WRITE_ERRORS:
@@ -311,13 +321,6 @@ def test_checkpoints(fault: str, run: Path, monkeypatch) -> None:
     assert (found, bool(re.search(pattern, said))) == (kind, True), said
     if fault in WRITE_ERRORS:
         assert sorted((run / "checkpoints").iterdir()) == [older, newest]
-
-
-def load_header(path: Path) -> str:
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        return file.metadata()["wildgs"]
 
 
 @pytest.mark.parametrize("fault", [f for i, f in EXISTING if i == "config.yaml"])
@@ -351,3 +354,74 @@ def test_configurations(fault: str, run: Path, monkeypatch) -> None:
     found, said = observe(act)
     assert (found, bool(re.search(pattern, said))) == (kind, True), said[:500]
     assert len(said) < 2000
+
+
+@pytest.fixture(scope="module")
+def method() -> WildGS:
+    torch.manual_seed(0)
+    config = WildGSConfig(wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)))
+    colors = torch.full((30, 3), 128, dtype=torch.uint8)
+    return WildGS.from_points(config, torch.rand(30, 3), colors, load_encoder(None)).eval()
+
+
+@pytest.mark.parametrize("fault", [f for i, f in EXISTING if i == "appearance"])
+def test_appearances(fault: str, method: WildGS, tmp_path: Path, monkeypatch) -> None:
+    kind, pattern, _ = table.TABLE["appearance"][fault]
+    appearance = method.encode(torch.rand(32, 48, 3), Camera(torch.eye(4), 30 * torch.eye(3), 48, 32))
+    look = look_of(method, appearance, "evening")
+    file = save_look(look, tmp_path / ("ü 写真 2.safetensors" if fault == "names" else "evening.safetensors"))
+    tensors = load_file(file)
+    with safe_open(file, framework="pt") as opened:
+        metadata = opened.metadata()
+
+    def act() -> None:
+        assert load_look(method, file).name == "evening"
+
+    if fault == "wrong size":
+        save_file(tensors | {"shared_local": torch.zeros(7)}, file, metadata=metadata)
+    elif fault == "NaN":
+        save_file(tensors | {"global_embedding": torch.full((16,), float("nan"))}, file, metadata=metadata)
+    elif fault == "huge":
+        file.write_bytes(struct.pack("<Q", 2**60) + file.read_bytes()[8:])
+    elif fault in WRITE_ERRORS:
+        monkeypatch.setattr(Path, "write_bytes", fail_with(WRITE_ERRORS[fault]))
+
+        def act() -> None:
+            save_look(look, tmp_path / "other.safetensors")
+    elif fault != "names":
+        spoil_file(file, fault)
+    found, said = observe(act)
+    assert (found, bool(re.search(pattern, said))) == (kind, True), said
+
+
+@pytest.mark.parametrize("fault", [f for i, f in EXISTING if i == "camera file"])
+def test_camera_files(fault: str, tmp_path: Path, monkeypatch) -> None:
+    kind, pattern, _ = table.TABLE["camera file"][fault]
+    cameras = [Camera(torch.eye(4), 30 * torch.eye(3), 48, 32) for _ in range(3)]
+    file = tmp_path / ("ü 写真 2.json" if fault == "names" else "path.json")
+    write_camera_path(file, cameras, fps=24.0)
+    content = json.loads(file.read_text())
+    second = content["cameras"][1]
+
+    def act() -> None:
+        path = read_camera_path(file)
+        assert (len(path.cameras), path.fps) == (4 if fault == "duplicate" else 3, 24)
+
+    changes: dict[str, Callable[[], None]] = {
+        "wrong size": lambda: second.__setitem__("viewmat", [[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        "NaN": lambda: second["viewmat"][0].__setitem__(3, float("nan")),
+        "huge": lambda: second.__setitem__("width", 10**9),
+        "duplicate": lambda: content["cameras"].append(second),
+    }
+    if fault in changes:
+        changes[fault]()
+        file.write_text(json.dumps(content))
+    elif fault in WRITE_ERRORS:
+        monkeypatch.setattr(Path, "write_text", fail_with(WRITE_ERRORS[fault]))
+
+        def act() -> None:
+            write_camera_path(tmp_path / "other.json", cameras, fps=24.0)
+    elif fault != "names":
+        spoil_file(file, fault)
+    found, said = observe(act)
+    assert (found, bool(re.search(pattern, said))) == (kind, True), said

@@ -14,6 +14,7 @@ from wildgs.data import Scene, View
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.protocol import Protocol
 from wildgs.export.report import MethodScores, Report, ReportExample, write_report
+from wildgs.geometry.tour import spread_out
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import Run
@@ -52,15 +53,11 @@ def write_showcase(
 
 
 def different_lights(views: Sequence[View], count: int) -> list[View]:
-    """Photos as unlike each other in colour as the collection allows, by farthest-point choice."""
+    """Photos as unlike each other in colour as the collection allows; the first is the most usual one."""
     if not views:
         return []
-    described = torch.stack([_colour_of(view) for view in views])
-    chosen = [int((described - described.mean(dim=0)).norm(dim=1).argmax())]
-    while len(chosen) < min(count, len(views)):
-        distance = torch.cdist(described, described[chosen]).min(dim=1).values
-        chosen.append(int(distance.argmax()))
-    return [views[index] for index in chosen]
+    described = torch.stack([_colour_of(view) for view in views]).double().numpy()
+    return [views[index] for index in spread_out(described, count)]
 
 
 def _colour_of(view: View) -> Tensor:

@@ -22,6 +22,8 @@ Frame = Literal["scene", "colmap"]
 FORMAT = "wildgs-cameras-1"
 DATAPARSER_FILE = "dataparser_transforms.json"
 DEFAULT_FPS = 30.0
+MAX_SIDE = 32_768
+"""Of a picture, pixels: what a file asks for is allocated."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,11 @@ class CameraPath:
 
 
 def write_camera_path(file: Path, cameras: Sequence[Camera], *, fps: float, frame: Frame = "scene") -> None:
-    """Writes our JSON."""
+    """Writes our JSON.
+
+    Raises:
+        UserError: The disk is full or read-only.
+    """
     content = {
         "format": FORMAT,
         "frame": frame,
@@ -55,10 +61,13 @@ def write_camera_path(file: Path, cameras: Sequence[Camera], *, fps: float, fram
             for camera in cameras
         ],
     }
-    file.parent.mkdir(parents=True, exist_ok=True)
     aside = file.with_name(file.name + ".part")
-    aside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    aside.replace(file)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        aside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        aside.replace(file)
+    except OSError as error:
+        raise UserError(f"{file} cannot be written ({error}); make room or choose another folder") from error
 
 
 def read_camera_path(file: Path) -> CameraPath:
@@ -71,7 +80,7 @@ def read_camera_path(file: Path) -> CameraPath:
         content = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise UserError(f"{file}: no such file; give a camera file or one of the built-in paths") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{file}: cannot be read as JSON ({error})") from error
     try:
         if isinstance(content, dict) and "camera_path" in content:
@@ -80,7 +89,7 @@ def read_camera_path(file: Path) -> CameraPath:
             path = _from_own(content)
         else:
             raise ValueError("holds neither 'cameras' (ours) nor 'camera_path' (nerfstudio's)")
-    except (KeyError, TypeError, ValueError, OSError) as error:
+    except (KeyError, TypeError, ValueError, OSError, OverflowError, RecursionError) as error:
         reason = f"there is no entry {error}" if isinstance(error, KeyError) else error
         raise UserError(f"{file}: is no camera file: {reason} (docs/cameras.md describes it)") from error
     if not path.cameras:
@@ -93,7 +102,7 @@ def _from_own(content: dict[str, Any]) -> CameraPath:
     if frame not in ("scene", "colmap"):
         raise ValueError(f"frame {frame!r} is neither 'scene' nor 'colmap'")
     cameras = []
-    for number, entry in enumerate(content["cameras"]):
+    for number, entry in enumerate(_list(content["cameras"], "cameras")):
         where = f"cameras[{number}]"
         size = (entry.get("width", content.get("width")), entry.get("height", content.get("height")))
         width, height = (_whole(value, where) for value in size)
@@ -119,9 +128,12 @@ def _from_nerfstudio(content: dict[str, Any], transforms: Path) -> CameraPath:
         transform[:3] *= float(parsed["scale"])
     back = np.linalg.inv(transform)
     cameras = []
-    for number, entry in enumerate(content["camera_path"]):
+    for number, entry in enumerate(_list(content["camera_path"], "camera_path")):
         pose = back @ _matrix(entry["camera_to_world"], (4, 4), f"camera_path[{number}]")
-        pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))  # the parser's scale moves, it does not magnify
+        volume = np.linalg.det(pose[:3, :3])
+        if not 1e-18 < abs(volume) < 1e18:
+            raise ValueError(f"camera_path[{number}]: the pose is no rotation")
+        pose[:3, :3] /= np.cbrt(volume)  # the parser's scale moves, it does not magnify
         pose[:3, 1:3] *= -1  # OpenGL's y up and z backward to OpenCV's
         K = _from_fov(entry["fov"], width, height)
         cameras.append(_camera(np.linalg.inv(pose), K, width, height))
@@ -137,6 +149,12 @@ def _camera(
     return Camera(torch.from_numpy(viewmat), torch.from_numpy(K), width, height)
 
 
+def _list(value: Any, where: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise ValueError(f"{where} is no list of cameras")
+    return value
+
+
 def _matrix(value: Any, shape: tuple[int, int], where: str) -> np.ndarray:
     matrix = np.array(value, dtype=np.float64)
     if matrix.size != shape[0] * shape[1] or not np.isfinite(matrix).all():
@@ -145,8 +163,13 @@ def _matrix(value: Any, shape: tuple[int, int], where: str) -> np.ndarray:
 
 
 def _whole(value: Any, where: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != int(value) or value < 1:
-        raise ValueError(f"{where}: width and height must be whole numbers above 0")
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not 1 <= value <= MAX_SIDE
+        or value % 1
+    ):
+        raise ValueError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIDE:,}")
     return int(value)
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.light.look import Look
@@ -27,7 +29,8 @@ def save_look(look: Look, file: Path) -> Path:
     one that most Gaussians share (outside the triplane's box all are alike).
 
     Raises:
-        UserError: The look is of a run that has one light only, or the name does not end as it must.
+        UserError: The look is of a run that has one light only, the name does not end as it must, or the disk is
+            full or read-only.
     """
     if look.embeddings is None:
         raise UserError("this run is plain 3dgs: it has one light, its own, and nothing to save")
@@ -48,10 +51,15 @@ def save_look(look: Look, file: Path) -> Path:
         "gaussians": str(len(local)),
         "run": fingerprint(look.method),
     }
-    file.parent.mkdir(parents=True, exist_ok=True)
     aside = file.with_name(file.name + ".part")
-    aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
-    aside.replace(file)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
+        aside.replace(file)
+    except OSError as error:
+        raise UserError(
+            f"{file} cannot be written ({error}); make room or choose another --output"
+        ) from error
     return file
 
 
@@ -69,21 +77,40 @@ def load_look(method: Method, file: Path) -> Look:
             if header["format"] != FORMAT:
                 raise KeyError("format")
             tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
-        shared, rows = tensors["shared_local"], tensors["rows"].long()
-        name, owner, count = str(header["name"]), header["run"], int(header["gaussians"])
-        global_embedding, inside = tensors["global_embedding"], tensors["local_embeddings"]
-        if len(rows) != len(inside) or bool(((rows < 0) | (rows >= count)).any()):
-            raise ValueError("rows of no Gaussian")
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        name, owner = str(header["name"]), header["run"]
+        # What of the file's numbers is believed must fit the run, or this is none of its files either.
+        own = isinstance(method, WildGS) and owner == fingerprint(method)
+        embeddings = _fitting(method, tensors) if isinstance(method, WildGS) and own else None
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
-    if not isinstance(method, WildGS) or owner != fingerprint(method):
+    if embeddings is None:
         raise UserError(
             f"{file}: was made with another run, or another step of this one; make it anew with `wildgs appearance`"
         )
+    return Look(name, embeddings, method)
+
+
+def _fitting(method: WildGS, tensors: Mapping[str, Tensor]) -> Embeddings:
+    """A file's embeddings for a method's Gaussians.
+
+    Raises:
+        KeyError: One is missing.
+        ValueError: They do not fit the method, or are no finite numbers.
+    """
+    count, outside = len(method.gaussians), method.wrapping.outside
+    shared, rows = tensors["shared_local"].float(), tensors["rows"]
+    common, inside = tensors["global_embedding"].float(), tensors["local_embeddings"].float()
+    if common.shape != (method.fusion.first_global.in_features,) or shared.shape != outside.shape:
+        raise ValueError("embeddings of another length")
+    if rows.dtype != torch.int32 or rows.dim() != 1 or inside.shape != (len(rows), *outside.shape):
+        raise ValueError("rows without embeddings")
+    if bool(((rows < 0) | (rows >= count)).any()):
+        raise ValueError("rows of no Gaussian")
+    if not all(bool(values.isfinite().all()) for values in (common, shared, inside)):
+        raise ValueError("embeddings that are no numbers")
     local = shared.repeat(count, 1)
-    local[rows] = inside.float()
-    device = method.gaussians.means.device
-    return Look(name, Embeddings(global_embedding.to(device), local.to(device)), method)
+    local[rows.long()] = inside
+    return Embeddings(common.to(outside.device), local.to(outside.device))
 
 
 def fingerprint(method: Method) -> str:
