@@ -189,5 +189,5 @@ def project_group(
         mask_bits(wide & (fn >= floor)),
         mask_bits(tall & (nf >= floor)),
         mask_bits(wide & tall & (ff >= floor)),
-        mask_bits(seen & (x1 - x0 < 2.0) & (y1 - y0 < 2.0)),
+        mask_bits((x1 - x0 < 2.0) & (y1 - y0 < 2.0)),
     )
