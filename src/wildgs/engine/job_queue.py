@@ -11,7 +11,8 @@ import time
 from collections.abc import Iterator, Mapping
 from datetime import timedelta
 
-from torch import distributed as dist
+from torch.distributed import PrefixStore, Store  # pyright: ignore[reportPrivateImportUsage]
+from torch.distributed.rendezvous import rendezvous
 
 from wildgs import launch
 from wildgs.errors import UserError
@@ -32,15 +33,15 @@ class JobQueue:
         Raises:
             UserError: The processes find no connection to each other.
         """
-        self._store: dist.Store | None = None
+        self._store: Store | None = None
         if launch.world_size() == 1:
             return
         try:
-            store, _, _ = next(iter(dist.rendezvous("env://", timeout=CONNECT)))
+            store, _, _ = next(iter(rendezvous("env://", timeout=CONNECT)))
         except (RuntimeError, ValueError) as error:
             reason = (str(error).splitlines() or [""])[0]
             raise UserError(f"the processes find no connection to each other: {reason}") from error
-        self._store = dist.PrefixStore(f"wildgs/{name}", store)
+        self._store = PrefixStore(f"wildgs/{name}", store)
 
     @property
     def first(self) -> bool:
