@@ -57,14 +57,15 @@ class Row:
 
 def time_steps(trainer: Trainer, count: int) -> float:
     """Median milliseconds of a step; the first ones warm up."""
-    times = []
-    for index in range(count + 3):
+    times, rhythm = [], trainer.config.schedule.encoder_every
+    for index in range(count + 2):
         start = time.perf_counter()
-        trainer.advance()
+        for _ in range(rhythm):
+            trainer.advance()
         if trainer.device.type == "cuda":
             torch.cuda.synchronize()
-        if index >= 3:
-            times.append(1e3 * (time.perf_counter() - start))
+        if index >= 2:
+            times.append(1e3 * (time.perf_counter() - start) / rhythm)
     return median(times)
 
 

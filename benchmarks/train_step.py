@@ -5,8 +5,9 @@
     python benchmarks/train_step.py --json                the rows, and nothing else, on stdout
 
 The scene is the demo's landmark with its points multiplied to N; both methods start from the same points and
-train in turns, so that a noisy machine slows both alike. Steps are of the second stage, all parts on, with the
-statistics of densification gathered and its rounds left out (they come once in a hundred steps and are timed for
+train in turns, so that a noisy machine slows both alike. A step is the mean over as many as the encoder's rhythm
+has (it learns on every second). Steps are of the second stage, all parts on, with the statistics of densification
+gathered and its rounds left out (they come once in a hundred steps and are timed for
 themselves). Times are medians over steps. Stages are timed in further steps that carry the clocks: a stage's
 backward time runs from the moment its gradient arrives to the moment the next stage's does.
 """
@@ -192,16 +193,18 @@ def make_trainer(
 
 
 def plain_steps(trainers: dict[MethodName, Trainer], count: int) -> dict[MethodName, list[float]]:
-    """Milliseconds of single steps, the methods taking turns."""
+    """Milliseconds of steps, the methods taking turns."""
     seconds: dict[MethodName, list[float]] = defaultdict(list)
     for index in range(count + 2):
         for name, trainer in trainers.items():
+            rhythm = trainer.config.schedule.encoder_every
             start = time.perf_counter()
-            trainer.advance()
+            for _ in range(rhythm):
+                trainer.advance()
             if trainer.device.type == "cuda":
                 torch.cuda.synchronize()
             if index >= 2:
-                seconds[name].append(1e3 * (time.perf_counter() - start))
+                seconds[name].append(1e3 * (time.perf_counter() - start) / rhythm)
     return seconds
 
 
@@ -240,7 +243,7 @@ def measure(scene: Scene, n: int, count: int, device: torch.device, model: WildG
     base = median(seconds["3dgs"])
     rows = []
     for name, trainer in trainers.items():
-        clock = stages_of(trainer, max(3, count // 2))
+        clock = stages_of(trainer, trainer.config.schedule.encoder_every * max(2, count // 4))
         camera = scene.train_views[0].camera
         times = seconds[name]
         rows.append(

@@ -21,6 +21,7 @@ def test_paper_leaves_out_all_that_is_ours() -> None:
         "model.fusion.color_transform": False,
         "model.depth_points.points": 0,
         "model.sky.points": 0,
+        "train.schedule.encoder_every": 1,
     }
 
 

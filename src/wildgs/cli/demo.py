@@ -13,7 +13,6 @@ from wildgs.cli.webpage import write_scene_page
 from wildgs.config import RunConfig
 from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig
-from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.parsing import ParsingConfig
@@ -31,7 +30,6 @@ SUMMARY = (
 
 MODEL = WildGSConfig(parsing=ParsingConfig(max_side=160))
 MAX_GAUSSIANS = 30_000
-ENCODER_EVERY = 2
 
 
 @dataclass(frozen=True)
@@ -88,8 +86,4 @@ def run(command: Command) -> None:
 
 def _training(steps: int) -> TrainConfig:
     """The defaults, with no more Gaussians than photos this small can tell apart."""
-    return TrainConfig(
-        steps=steps,
-        schedule=ScheduleConfig(encoder_every=ENCODER_EVERY),
-        density=DensityConfig(max_gaussians=MAX_GAUSSIANS),
-    )
+    return TrainConfig(steps=steps, density=DensityConfig(max_gaussians=MAX_GAUSSIANS))

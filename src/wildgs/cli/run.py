@@ -20,14 +20,12 @@ from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
 from wildgs.data.images import UnreadableImageError, open_image
 from wildgs.data.photos import SfmConfig
 from wildgs.engine.density import DensityConfig
-from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.runs import default_device, load_run
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
 CPU_MAX_GAUSSIANS = 80_000
-CPU_ENCODER_EVERY = 2
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,7 @@ def _configure(command: Command, folder: Path) -> tuple[RunConfig, Scene]:
     data = DataConfig(downscale=downscale, holdout=command.holdout)
     most = command.max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
     budget = DensityConfig(max_gaussians=most)
-    schedule = ScheduleConfig() if gpu else ScheduleConfig(encoder_every=CPU_ENCODER_EVERY)
-    train = TrainConfig(steps=steps, schedule=schedule, density=budget)
+    train = TrainConfig(steps=steps, density=budget)
     config = RunConfig(folder.resolve(), "wildgs", data, train=train)
     return config, read_scene(config)
 

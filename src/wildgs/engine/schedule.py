@@ -23,7 +23,7 @@ class ScheduleConfig:
         mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
-        encoder_every: The photo's encoder learns on one step in so many (not scaled).
+        encoder_every: The photo's encoder learns on one step in so many (not scaled; paper: 1).
     """
 
     first_stage: int = 3000
@@ -33,7 +33,7 @@ class ScheduleConfig:
     reset_every: int = 3000
     mask_pause: int = 500
     sh_every: int = 1000
-    encoder_every: int = 1
+    encoder_every: int = 2
 
 
 _FLOORS = {
