@@ -122,7 +122,7 @@ class Parsing(MixedModule):
         so that Emb^g leaves it likewise: pooled features of different photos are nearly the same vector, and
         without this many steps go by until the embedding says anything about the light.
         """
-        side = min(self.config.max_side, CALIBRATION_SIDE)
+        side = max(LEAST_SIDE, min(self.config.max_side, CALIBRATION_SIDE))
         squares = torch.cat(
             [
                 functional.interpolate(photo.permute(2, 0, 1)[None], size=(side, side), mode="bilinear")
