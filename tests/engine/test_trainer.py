@@ -32,11 +32,12 @@ def trainer_for(
 @pytest.mark.parametrize("method", ["wildgs", "3dgs"])
 def test_loss_falls(wall_scene: Scene, tiny_model: WildGSConfig, method: MethodName) -> None:
     bright = replace(wall_scene, views=wall_scene.views[1::2])
-    trainer = trainer_for(bright, tiny_model, 100, method)
+    # The encoder learns on every second step: after 100 one seed of four had hardly begun.
+    trainer = trainer_for(bright, tiny_model, 200, method)
     losses: list[float] = []
     trainer.run([lambda report: losses.append(float(report.losses.image.detach()))])
-    assert trainer.step == 100
-    assert len(losses) == 100
+    assert trainer.step == 200
+    assert len(losses) == 200
     assert sum(losses[-14:]) < 0.6 * sum(losses[:14])
 
 
