@@ -232,6 +232,7 @@ def _read_checkpoints(folder: Path) -> object:
     return newest
 
 
+@functools.cache
 def _method() -> Any:
     import torch
 
@@ -245,9 +246,6 @@ def _method() -> Any:
     return WildGS.from_points(config, torch.rand(30, 3), colors, load_encoder(None)).eval()
 
 
-METHOD = functools.cache(_method)
-
-
 def _appearance(folder: Path) -> list[str]:
     import torch
 
@@ -256,7 +254,7 @@ def _appearance(folder: Path) -> list[str]:
     from wildgs.light.saved import save_look
 
     camera = Camera(torch.eye(4), 30 * torch.eye(3), 48, 32)
-    look = look_of(METHOD(), METHOD().encode(torch.rand(32, 48, 3), camera), "evening")
+    look = look_of(_method(), _method().encode(torch.rand(32, 48, 3), camera), "evening")
     save_look(look, folder / "evening.safetensors")
     return ["evening.safetensors"]
 
@@ -264,7 +262,7 @@ def _appearance(folder: Path) -> list[str]:
 def _read_appearance(folder: Path) -> object:
     from wildgs.light.saved import load_look
 
-    return load_look(METHOD(), folder / "evening.safetensors")
+    return load_look(_method(), folder / "evening.safetensors")
 
 
 def _cameras(folder: Path) -> list[str]:

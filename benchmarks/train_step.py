@@ -7,9 +7,9 @@
 The scene is the demo's landmark with its points multiplied to N; both methods start from the same points and
 train in turns, so that a noisy machine slows both alike. A step is the mean over as many as the encoder's rhythm
 has (it learns on every second). Steps are of the second stage, all parts on, with the statistics of densification
-gathered and its rounds left out (they come once in a hundred steps and are timed for
-themselves). Times are medians over steps. Stages are timed in further steps that carry the clocks: a stage's
-backward time runs from the moment its gradient arrives to the moment the next stage's does.
+gathered and its rounds left out (they come once in a hundred steps and are timed for themselves). Times are
+medians over steps. Stages are timed in further steps that carry the clocks: a stage's backward time runs from the
+moment its gradient arrives to the moment the next stage's does.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ import yaml.composer
 from wildgs.data import DataConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
+from wildgs.files import written_aside
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
 
@@ -132,17 +133,10 @@ def write_config(path: Path, config: RunConfig) -> None:
     Raises:
         UserError: The disk is full, or the folder cannot be written to.
     """
-    aside = path.with_name(path.name + ".partial")
-    try:
-        with aside.open("w", encoding="utf-8") as file:
-            yaml.safe_dump(to_plain(config), file, sort_keys=False)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(path)
-    except OSError as error:
-        raise UserError(
-            f"{path} cannot be written ({error}); make room or choose another --output"
-        ) from error
+    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
+        yaml.safe_dump(to_plain(config), file, sort_keys=False)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read_config(path: Path) -> RunConfig:

@@ -41,6 +41,10 @@ _MODEL: dict[str, Cell] = {
 }
 _BAD_MASK = ("error", r"masks.p02\.png.*mend the mask or remove it", "error: mend or remove it")
 _BAD_DEPTH = ("left out", r"depth.p02\.png.*trains without depth", "photo trains without depth")
+_NOT_WRITTEN: dict[str, Cell] = {
+    "read-only": ("error", "cannot be written", "error"),
+    "full disk": ("error", "cannot be written .*make room", "error"),
+}
 _NO_APPEARANCE = ("error", "is no appearance file", "error")
 _DAMAGED = ("left out", r"step_00000002\.safetensors is damaged", "the one before is used")
 
@@ -135,8 +139,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "huge": ("error", r"config\.yaml", "error, without unfolding it"),
         "duplicate": ("used", "", "the last counts"),
         "names": ("used", "", "used"),
-        "read-only": ("error", "cannot be written", "error"),
-        "full disk": ("error", "cannot be written .*make room", "error"),
+        **_NOT_WRITTEN,
         "link loop": ("error", "is not a run folder", "error"),
     },
     "appearance": {
@@ -149,8 +152,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "huge": _NO_APPEARANCE,
         "duplicate": None,
         "names": ("used", "", "used"),
-        "read-only": ("error", "cannot be written", "error"),
-        "full disk": ("error", "cannot be written .*make room", "error"),
+        **_NOT_WRITTEN,
         "link loop": ("error", "no such file", "error"),
     },
     "camera file": {
@@ -163,8 +165,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "huge": ("error", r"cameras\[1\]: width and height", "error: pictures over 32,768 a side"),
         "duplicate": ("used", "", "used: the camera stands still"),
         "names": ("used", "", "used"),
-        "read-only": ("error", "cannot be written", "error"),
-        "full disk": ("error", "cannot be written .*make room", "error"),
+        **_NOT_WRITTEN,
         "link loop": ("error", "cannot be read as JSON", "error"),
     },
 }

@@ -29,6 +29,7 @@ from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.data import DataConfig, Scene
 from wildgs.engine.checkpoint import list_checkpoints
+from wildgs.engine.collectives import raise_once
 from wildgs.engine.distributed import settle
 from wildgs.engine.job_queue import JobQueue
 from wildgs.engine.trainer import TrainConfig
@@ -40,6 +41,7 @@ from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
+from wildgs.files import written_aside
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import CHECKPOINT_FOLDER, load_run
 from wildgs.version import __version__
@@ -103,7 +105,9 @@ def run(command: Command) -> None:
         bench.do(jobs[number])
         if queue.first:
             bench.write_table()
-    failures = queue.gather("failures", bench.failures)
+    failures = {
+        title: why for each in queue.gather("failures", bench.failures) for title, why in each.items()
+    }
     if queue.first:
         _print_table(bench.write_table())
     console.print(f"{command.output / 'table.md'}, table.csv and table.json hold the table")
@@ -114,18 +118,13 @@ def run(command: Command) -> None:
 def _plan_together(command: Command, queue: JobQueue) -> list[Job]:
     """The jobs, which must make sense to all processes; the first one tells what does not."""
     jobs: list[Job] = []
-    own: dict[str, str] = {}
+    own: UserError | None = None
     try:
         jobs = _plan(command)
     except UserError as error:
-        own = {_speaker(): str(error)}
-    mistakes = queue.gather("mistakes", own)
-    if not mistakes:
-        return jobs
-    if not queue.first:
-        raise ReportedError("the bench makes no sense")
-    speaker, mistake = next(iter(mistakes.items()))
-    raise UserError(mistake if speaker == _speaker() else f"{speaker}{mistake}")
+        own = error
+    raise_once(queue.gather("mistakes", None if own is None else str(own)), launch.rank(), own)
+    return jobs
 
 
 def _tell(failures: Mapping[str, str], count: int, queue: JobQueue) -> None:
@@ -278,10 +277,8 @@ def _notes(scores: Sequence[Score]) -> list[str]:
 
 
 def _write_text(file: Path, text: str) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_name(file.name + ".part")
-    aside.write_text(text, encoding="utf-8")
-    aside.replace(file)
+    with written_aside(file) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def _print_table(rows: Sequence[Row]) -> None:

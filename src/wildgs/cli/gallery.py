@@ -19,6 +19,7 @@ from wildgs.data import Scene, View, find_view, match_view
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
 from wildgs.export.sheet import contact_sheet
+from wildgs.files import written_aside
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.light.sources import read_picture
 
@@ -59,9 +60,8 @@ def run(command: Command) -> None:
     tiles = render_tiles(scene, views, looks, output)
     # A mix of several photos has no photo to stand above it.
     sources = [source_picture(scene.scene, spec) for spec in specs] if len(looks) == len(specs) else []
-    aside = output / "gallery.jpg.part"
-    draw_sheet(views, looks, tiles, sources).save(aside, "JPEG", quality=QUALITY)
-    aside.replace(output / "gallery.jpg")
+    with written_aside(output / "gallery.jpg") as aside:
+        draw_sheet(views, looks, tiles, sources).save(aside, "JPEG", quality=QUALITY)
     console.print(f"{len(views)} views x {len(looks)} appearances -> {output / 'gallery.jpg'}")
 
 

@@ -124,9 +124,8 @@ def _look(
     # Beyond the farthest points that were fitted, a small error of the disparity is a large one of depth.
     reliable = (disparity > 0) & (inverse * z[known].sort().values[int(0.98 * (int(known.sum()) - 1))] > 1)
     depth = torch.where(reliable, 1 / inverse.clamp_min(1e-6), 0.0)
-    step = max(
-        1, int(0.5 * config.cell * float(view.camera.K[0, 0]))
-    )  # two to a cell's side at the usual depth
+    # Two to a cell's side at the usual depth.
+    step = max(1, int(0.5 * config.cell * float(view.camera.K[0, 0])))
     keep = (depth > 0) & (depth < config.farthest)
     mask = view.read_mask()
     if mask is not None:

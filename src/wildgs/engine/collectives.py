@@ -1,4 +1,4 @@
-"""What ranks exchange, without knowing what training is: sums over flat buckets, and fingerprints of tensors."""
+"""What ranks exchange, without knowing what training is: sums over flat buckets, fingerprints, mistakes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 from torch import distributed as dist
+
+from wildgs.errors import ReportedError, UserError
 
 BUCKET_ELEMENTS = 1 << 22
 """Tensors smaller than this travel together, in messages of at most about twice so many numbers: 16 MB and more
@@ -76,3 +78,24 @@ def _fingerprint(tensor: Tensor) -> Int[Tensor, ""]:
         place = torch.arange(start + 1, start + 1 + part.numel(), device=tensor.device) * _ODD
         total = total + ((part ^ (place >> 29)) * (place | 1)).sum()
     return total + tensor.numel()
+
+
+def raise_once(messages: Sequence[str | None], rank: int, own: UserError | None = None) -> None:
+    """Ends all ranks where one made a mistake, and tells it once.
+
+    Args:
+        messages: Every rank's mistake, None for those without.
+        rank: This one.
+        own: This rank's mistake.
+
+    Raises:
+        UserError: On rank 0: its own mistake, or the first other one and whose it is.
+        ReportedError: On the other ranks.
+    """
+    failed = [other for other, message in enumerate(messages) if message is not None]
+    if not failed:
+        return
+    message = str(messages[failed[0]])
+    if rank:
+        raise ReportedError(message)
+    raise own if own is not None else UserError(f"rank {failed[0]}: {message}")

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch import distributed as dist
 
 from wildgs import launch
-from wildgs.engine.collectives import fingerprints, sum_over_ranks
+from wildgs.engine.collectives import fingerprints, raise_once, sum_over_ranks
 from wildgs.engine.density import ScreenStatistics
 from wildgs.engine.team import DivergedRanksError, LostRankError, Team
 from wildgs.errors import ReportedError, UserError, WildGSWarning
@@ -65,13 +65,7 @@ class Ranks(Team):
                 yield
             except UserError as error:
                 own = error
-        messages = self._gather(None if own is None else str(own))
-        failed = [rank for rank, message in enumerate(messages) if message is not None]
-        if not failed:
-            return
-        if not self.first:
-            raise ReportedError(messages[failed[0]])
-        raise own if own is not None else UserError(f"rank {failed[0]}: {messages[failed[0]]}")
+        raise_once(self._gather(None if own is None else str(own)), self.rank, own)
 
     def from_first(self, function: Callable[[], Result]) -> Result:  # noqa: D102 - as in Team
         result: list[Any] = [None]

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from datetime import timedelta
+from typing import Any
 
 from torch.distributed import PrefixStore, Store  # pyright: ignore[reportPrivateImportUsage]
 from torch.distributed.rendezvous import rendezvous
@@ -56,22 +57,20 @@ class JobQueue:
         while (number := self._store.add("next", 1) - 1) < count:
             yield number
 
-    def gather(self, what: str, own: Mapping[str, str]) -> dict[str, str]:
-        """Waits until every process has come here; what all of them bring, in the order of ranks.
+    def gather(self, what: str, own: Any) -> list[Any]:
+        """Waits until every process has come here; what each of them brings, in the order of ranks.
 
         Waiting has no limit: the last job may take hours, and torchrun ends all if a process is lost.
 
         Args:
             what: Name of this meeting; every meeting has its own.
-            own: What this process brings.
+            own: What this process brings; JSON has to know it.
         """
         if self._store is None:
-            return dict(own)
-        self._store.set(f"{what}/{launch.rank()}", json.dumps(dict(own)))
+            return [own]
+        self._store.set(f"{what}/{launch.rank()}", json.dumps(own))
         self._wait_for_all(f"{what}/brought")
-        gathered: dict[str, str] = {}
-        for rank in range(launch.world_size()):
-            gathered |= json.loads(self._store.get(f"{what}/{rank}"))
+        gathered = [json.loads(self._store.get(f"{what}/{rank}")) for rank in range(launch.world_size())]
         self._wait_for_all(f"{what}/read")  # a store may end with the process that keeps it
         return gathered
 

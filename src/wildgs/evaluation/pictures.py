@@ -12,6 +12,8 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from wildgs.files import written_aside
+
 
 def picture_paths(names: Iterable[str]) -> dict[str, PurePosixPath]:
     """Where each view's picture goes, relative to the evaluation's folder.
@@ -45,15 +47,11 @@ def _inside(name: str) -> PurePosixPath:
 
 def write_picture(file: Path, picture: UInt8[Tensor, "H W 3"]) -> None:
     """Write a PNG; a run cut short leaves no half picture under its name."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_name(file.name + ".part")
-    Image.fromarray(picture.cpu().numpy()).save(aside, format="PNG")
-    aside.replace(file)
+    with written_aside(file) as aside:
+        Image.fromarray(picture.cpu().numpy()).save(aside, format="PNG")
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:
     """Write strict JSON (no NaN), aside first and renamed."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_name(file.name + ".part")
-    aside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    aside.replace(file)
+    with written_aside(file) as aside:
+        aside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

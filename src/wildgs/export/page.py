@@ -21,6 +21,7 @@ from torch import Tensor
 
 from wildgs.export.page_scene import PackedScene, pack_scene
 from wildgs.export.splats import Splats
+from wildgs.files import written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.sh_cut import cut_sh, fit_cut
 
@@ -108,10 +109,8 @@ def write_page(
         content = _compose(page, _pack(page, degree, viewpoints)).encode()
         if len(content) <= BUDGET_BYTES:
             break
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_name(f".{file.name}.part")
-    aside.write_bytes(content)
-    aside.replace(file)
+    with written_aside(file) as aside:
+        aside.write_bytes(content)
     return degree
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from wildgs.export.splats import Splats
+from wildgs.files import written_aside
 
 _LEAST = 1e-6
 """Opacities nearer to 0 or 1 than this have no finite logit in single precision."""
@@ -48,7 +49,5 @@ def ply_bytes(splats: Splats) -> bytes:
 
 def write_bytes(file: Path, content: bytes) -> None:
     """Writes a file aside first and then renames it, so that no half file is ever left."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_name(f".{file.name}.part")
-    aside.write_bytes(content)
-    aside.replace(file)
+    with written_aside(file) as aside:
+        aside.write_bytes(content)

@@ -17,6 +17,7 @@ from PIL import Image
 
 from wildgs.export.depth_colors import color_depth
 from wildgs.export.report_scores import MethodScores, scores_section
+from wildgs.files import written_aside
 
 __all__ = ["MethodScores", "Report", "ReportExample", "write_report"]
 
@@ -84,10 +85,8 @@ def write_report(report: Report, file: Path) -> None:
         examples=_examples(report.examples),
         footer="Written by Wild-GS. The pictures are part of this file; nothing is loaded from elsewhere.",
     )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_name(f".{file.name}.part")
-    aside.write_text(page, encoding="utf-8")
-    aside.replace(file)
+    with written_aside(file) as aside:
+        aside.write_text(page, encoding="utf-8")
 
 
 def _examples(examples: Sequence[ReportExample]) -> str:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from wildgs.errors import UserError
+from wildgs.files import written_aside
 from wildgs.geometry.camera import Camera
 
 Frame = Literal["scene", "colmap"]
@@ -61,13 +62,8 @@ def write_camera_path(file: Path, cameras: Sequence[Camera], *, fps: float, fram
             for camera in cameras
         ],
     }
-    aside = file.with_name(file.name + ".part")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(file) as aside:
         aside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        aside.replace(file)
-    except OSError as error:
-        raise UserError(f"{file} cannot be written ({error}); make room or choose another folder") from error
 
 
 def read_camera_path(file: Path) -> CameraPath:

@@ -13,6 +13,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from wildgs.errors import UserError
+from wildgs.files import written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
 from wildgs.model.method import Method
@@ -48,18 +49,10 @@ def save_look(look: Look, file: Path) -> Path:
     header = {
         "format": FORMAT,
         "name": look.name,
-        "gaussians": str(len(local)),
         "run": fingerprint(look.method),
     }
-    aside = file.with_name(file.name + ".part")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(file) as aside:
         aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
-        aside.replace(file)
-    except OSError as error:
-        raise UserError(
-            f"{file} cannot be written ({error}); make room or choose another --output"
-        ) from error
     return file
 
 
@@ -78,16 +71,14 @@ def load_look(method: Method, file: Path) -> Look:
                 raise KeyError("format")
             tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
         name, owner = str(header["name"]), header["run"]
-        # What of the file's numbers is believed must fit the run, or this is none of its files either.
-        own = isinstance(method, WildGS) and owner == fingerprint(method)
-        embeddings = _fitting(method, tensors) if isinstance(method, WildGS) and own else None
+        if not isinstance(method, WildGS) or owner != fingerprint(method):
+            raise UserError(
+                f"{file}: was made with another run, or another step of this one; make it anew with "
+                "`wildgs appearance`"
+            )
+        return Look(name, _fitting(method, tensors), method)
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
-    if embeddings is None:
-        raise UserError(
-            f"{file}: was made with another run, or another step of this one; make it anew with `wildgs appearance`"
-        )
-    return Look(name, embeddings, method)
 
 
 def _fitting(method: WildGS, tensors: Mapping[str, Tensor]) -> Embeddings:
