@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -126,6 +127,17 @@ def test_help_as_a_subprocess_is_instant_and_loads_no_torch() -> None:
     assert result.returncode == 0, result.stderr
     assert "wildgs VERB" in result.stdout
     assert time.monotonic() - start < 5
+
+
+def test_a_reader_who_leaves_early_sees_no_traceback() -> None:
+    code = "from wildgs.cli import main; main(['demo', '--help'])"
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as pipe:
+        result = subprocess.run(
+            [sys.executable, "-c", code], stdout=pipe, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (result.returncode, result.stderr) == (141, "")
 
 
 def test_mistake_as_a_subprocess(tmp_path: Path) -> None:

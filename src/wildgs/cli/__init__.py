@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import sys
 import warnings
 
@@ -31,6 +32,8 @@ DISTRIBUTED = ("train", "bench")
 USER_ERROR = 2
 logging.getLogger("wildgs").addHandler(logging.NullHandler())  # or Python prints what is logged a second time
 INTERRUPTED = 130
+BROKEN_PIPE = 141
+"""As a shell says it of `wildgs ... | head`, whose reader had enough."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -53,10 +56,25 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(USER_ERROR)
     except UserError as error:
         _fail(" ".join(str(error).split()))
+    except BrokenPipeError:
+        if not _reader_has_left():
+            raise
+        sys.exit(BROKEN_PIPE)
     except KeyboardInterrupt as interrupt:
         if not launch.rank():
             print(str(interrupt) or "interrupted", file=sys.stderr)
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
+
+
+def _reader_has_left() -> bool:
+    """Whether nobody reads what is printed any more; then nothing is printed any more either."""
+    try:
+        print(flush=True)  # what failed before is no longer in the buffer
+    except BrokenPipeError:
+        # Python flushes once more on its way out, and would complain then.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def _run(verb: str, arguments: list[str]) -> None:
