@@ -171,3 +171,30 @@ def test_folder_with_another_network_is_a_users_mistake(tmp_path: Path) -> None:
         load_encoder(str(tmp_path))
     with pytest.raises(UserError, match="does not hold a ResNet-18"):
         load_encoder(str(tmp_path.parent))
+
+
+@pytest.mark.parametrize("start", [60.0, -60.0])
+def test_a_mask_far_out_comes_back(start: float) -> None:
+    """A sigmoid at the end of its range passes no gradient; masks that had closed stayed closed."""
+    torch.manual_seed(0)
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
+    assert parsing.mask_head.bias is not None
+    torch.nn.init.constant_(parsing.mask_head.bias, start)
+    optimizer = torch.optim.SGD([parsing.mask_head.bias], lr=2e5)
+    photo = torch.rand(32, 48, 3)
+    for _ in range(2):
+        visibility, _ = parsing(photo)
+        assert 0.01 < float(visibility.detach().min()) <= float(visibility.detach().max()) < 0.99
+        optimizer.zero_grad()
+        (visibility.mean() if start > 0 else -visibility.mean()).backward()
+        optimizer.step()
+    moved = float(parsing.mask_head.bias.detach() - start)
+    assert moved < 0 if start > 0 else moved > 0
+    before = parsing.mask_head.bias.detach().clone()
+    torch.nn.init.constant_(parsing.mask_head.bias, start)
+    optimizer.zero_grad()
+    visibility, _ = parsing(photo)
+    (-visibility.mean() if start > 0 else visibility.mean()).backward()
+    optimizer.step()
+    assert float(parsing.mask_head.bias.detach()) == start, "further out there is nothing to go to"
+    assert float(before) != start

@@ -7,10 +7,18 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from wildgs.losses.ssim import ssim, ssim_map
+from wildgs.losses.ssim import ssim
 
-EVIDENCE_SCALE = 2
-"""The mask's evidence is gathered at half resolution: cheaper, and deaf to detail that is a pixel off."""
+EVIDENCE_CELLS = 60
+"""The mask's evidence is gathered in so many cells along the long side: paving and bricks that the scene has not
+learnt yet, or that are a pixel off, average out; people do not."""
+BRIGHTNESS_SHARE = 0.5
+"""Of a difference in brightness against one in colour, squared: light and shadow change the one, people also the
+other."""
+HALF_EVIDENCE = 0.15
+"""Difference of colours at which evidence reaches half of its limit."""
+MOST_EVIDENCE = 0.8
+"""Its limit, in units of the image loss: twice λ^M's start, so that what is surely in the way is hidden at once."""
 
 
 def masked_photometric(
@@ -26,9 +34,7 @@ def masked_photometric(
 
     The value is the formula's, and so is the gradient to the render. The gradient to the mask is not: through
     SSIM of two pictures that share a factor M, a mask lowers the loss by being textured itself, and learns the
-    scene's edges instead of passers-by. Here hiding a pixel is worth what the pixel's `mismatch` exceeds the
-    photo's median by: while all of a photo is still wrong, nothing is transient, and the mask cannot settle on
-    hiding everything.
+    scene's edges instead of passers-by. Here hiding a pixel is worth its `transient_evidence`.
 
     Args:
         photo: The reference photo I, in 0..1.
@@ -44,32 +50,37 @@ def masked_photometric(
     fixed = visibility.detach()
     loss = _photometric(photo * fixed[..., None], render * fixed[..., None], weight_l1)
     if visibility.requires_grad:
-        cost = mismatch(photo, render.detach(), weight_l1)
-        excess = (cost - cost.median()).clamp_min(0)
-        # Adds nothing to the value, and the excess to the mask's gradient.
-        loss = loss + ((visibility - fixed) * excess).mean()
+        # Adds nothing to the value, and the evidence to the mask's gradient.
+        loss = loss + ((visibility - fixed) * transient_evidence(photo, render.detach())).mean()
     return loss
 
 
 @torch.no_grad()
-def mismatch(
-    photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"], weight_l1: float = 0.8
-) -> Float[Tensor, "H W"]:
-    """What a pixel costs in the image loss when nothing is masked: ``λ |I - Î| + (1 - λ) (1 - SSIM)``.
+def transient_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
+    """How much a pixel looks as if something stood in the way, from 0 to `MOST_EVIDENCE`.
+
+    The difference x of mean colours in cells, brightness counting less than hue, beyond the photo's median: while
+    all of a photo is still wrong, nothing is transient, and the mask cannot settle on hiding everything. Then
+    ``x⁴ / (x⁴ + s⁴)``: what is clearly wrong is wrong alike, what is a little off is not, and one edge does not
+    outweigh a person.
 
     Args:
         photo: I, in 0..1.
         render: Î.
-        weight_l1: λ.
 
     Returns:
-        The mean over channels, at half resolution and interpolated up.
+        Interpolated up from cells to pixels.
     """
-    pair = torch.stack([photo, render]).permute(0, 3, 1, 2)
-    small = functional.avg_pool2d(pair, EVIDENCE_SCALE, ceil_mode=True, count_include_pad=False)
-    x, y = small.permute(0, 2, 3, 1)
-    cost = (weight_l1 * (x - y).abs() + (1 - weight_l1) * (1 - ssim_map(x, y))).mean(dim=-1)
-    return functional.interpolate(cost[None, None], size=photo.shape[:2], mode="bilinear")[0, 0]
+    height, width = photo.shape[:2]
+    side = max(1, round(max(height, width) / EVIDENCE_CELLS))
+    difference = (photo - render.clamp(0, 1)).permute(2, 0, 1)[None]
+    cells = functional.avg_pool2d(difference, side, ceil_mode=True, count_include_pad=False)
+    brightness = cells.mean(dim=1, keepdim=True)
+    hue = (cells - brightness).square().sum(dim=1, keepdim=True)
+    distance = (2 * (hue + BRIGHTNESS_SHARE * brightness.square())).sqrt()
+    fourth = (distance - distance.median()).clamp_min(0) ** 4
+    evidence = MOST_EVIDENCE * fourth / (fourth + HALF_EVIDENCE**4)
+    return functional.interpolate(evidence, size=(height, width), mode="bilinear")[0, 0]
 
 
 def _photometric(photo: Tensor, render: Tensor, weight_l1: float) -> Tensor:

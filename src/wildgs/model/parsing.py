@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,8 @@ OPPONENTS = ((1 / 3, 1 / 3, 1 / 3), (0.5, -0.5, 0.0), (-0.25, -0.25, 0.5))
 STATISTICS = 2 * len(OPPONENTS)
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
+LOGIT_BOUND = 4.0
+"""Of the mask, so that it stays within 0.018 and 0.982: further out no gradient is left to bring it back."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,21 @@ class ParsingConfig:
     color_statistics: bool = True
     global_size: int = 16
     decoder_widths: tuple[int, int, int] = (128, 64, 32)
+
+
+class _Bounded(torch.autograd.Function):
+    """Clamps; gradients pass where they lead back inside, too."""
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.save_for_backward(logits)
+        return logits.clamp(-LOGIT_BOUND, LOGIT_BOUND)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (logits,) = ctx.saved_tensors
+        outwards = (logits.abs() > LOGIT_BOUND) & (gradient * logits < 0)
+        return torch.where(outwards, 0.0, gradient)
 
 
 class Parsing(MixedModule):
@@ -102,7 +120,7 @@ class Parsing(MixedModule):
         logits = functional.interpolate(
             coarse.float(), size=photo.shape[:2], mode="bilinear", align_corners=False
         )
-        return logits[0, 0].sigmoid(), embedding
+        return _Bounded.apply(logits[0, 0]).sigmoid(), embedding
 
     def _summary(self, images: Float[Tensor, "B 3 H W"], deepest: Tensor) -> Float[Tensor, "B S"]:
         """What M^G reads: the average of the deepest features and, where configured, the colour statistics."""
