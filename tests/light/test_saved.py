@@ -28,6 +28,8 @@ def test_round_trip(method, look, tmp_path: Path) -> None:
     torch.testing.assert_close(
         back.embeddings.local_embeddings, look.embeddings.local_embeddings, atol=2e-3, rtol=2e-3
     )
+    assert look.embeddings.color_map.any()
+    assert torch.equal(back.embeddings.color_map, look.embeddings.color_map)
     assert [path.name for path in file.parent.iterdir()] == [file.name]
 
 
@@ -51,7 +53,7 @@ def test_plain_3dgs_has_nothing_to_save(vanilla, tmp_path: Path) -> None:
 
 
 def _strange_tensors(file: Path, look) -> None:
-    save_file({"x": torch.zeros(2)}, file, metadata={"wildgs": '{"format": "wildgs-appearance-1"}'})
+    save_file({"x": torch.zeros(2)}, file, metadata={"wildgs": '{"format": "wildgs-appearance-2"}'})
 
 
 def _rows_out_of_range(file: Path, look) -> None:

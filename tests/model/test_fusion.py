@@ -43,6 +43,20 @@ def test_the_transform_maps_colours_from_every_direction(degree: int) -> None:
     )
 
 
+@pytest.mark.parametrize("with_transform", [True, False])
+def test_a_colour_map_acts_after_everything_else(with_transform: bool) -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(color_transform=with_transform), 16, 16)
+    if fusion.transform is not None:
+        torch.nn.init.normal_(fusion.transform.weight, std=0.1)
+    given = inputs(fusion, torch.rand(50, 3))
+    directions = torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
+    before = eval_sh(fusion(*given), directions, 3)
+    change = 0.3 * torch.randn(3, 4)
+    after = eval_sh(fusion(*given, change), directions, 3)
+    torch.testing.assert_close(after, before + before @ change[:, :3].T + change[:, 3], atol=1e-4, rtol=0)
+
+
 def test_the_embedding_drives_the_transform() -> None:
     torch.manual_seed(0)
     fusion = Fusion(FusionConfig(output_scale=0.0), 16, 16)

@@ -27,7 +27,7 @@ class Atlas:
     Attributes:
         views: The photos.
         global_embeddings: Emb^g of each.
-        mean: Mean of global and local embeddings over the photos: the neutral light.
+        mean: Mean of all embeddings and colour maps over the photos: the neutral light.
     """
 
     views: tuple[View, ...]
@@ -51,14 +51,17 @@ def make_atlas(method: WildGS, views: Sequence[View], progress: Progress | None 
     """
     count = min(len(views), MAX_PHOTOS)
     chosen = tuple(views[index * len(views) // count] for index in range(count))
-    global_embeddings, local_mean = [], None
+    global_embeddings, color_maps, local_mean = [], [], None
     for number, view in enumerate(chosen, start=1):
         embeddings = method.embed(encode_view(method, view))
         global_embeddings.append(embeddings.global_embedding)
+        if embeddings.color_map is not None:
+            color_maps.append(embeddings.color_map)
         local = embeddings.local_embeddings / count
         local_mean = local if local_mean is None else local_mean.add_(local)
         if progress is not None:
             progress(number, count)
     assert local_mean is not None
     stacked = torch.stack(global_embeddings)
-    return Atlas(chosen, stacked, Embeddings(stacked.mean(dim=0), local_mean))
+    color_map = torch.stack(color_maps).mean(dim=0) if color_maps else None
+    return Atlas(chosen, stacked, Embeddings(stacked.mean(dim=0), local_mean, color_map))

@@ -20,7 +20,7 @@ from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
 
 SUFFIX = ".safetensors"
-FORMAT = "wildgs-appearance-1"
+FORMAT = "wildgs-appearance-2"
 
 
 def save_look(look: Look, file: Path) -> Path:
@@ -46,6 +46,8 @@ def save_look(look: Look, file: Path) -> Path:
         "rows": rows.to(torch.int32),
         "local_embeddings": local[rows].half().contiguous(),
     }
+    if look.embeddings.color_map is not None:
+        tensors["color_map"] = look.embeddings.color_map.detach().cpu().contiguous()
     header = {
         "format": FORMAT,
         "name": look.name,
@@ -97,11 +99,16 @@ def _fitting(method: WildGS, tensors: Mapping[str, Tensor]) -> Embeddings:
         raise ValueError("rows without embeddings")
     if bool(((rows < 0) | (rows >= count)).any()):
         raise ValueError("rows of no Gaussian")
-    if not all(bool(values.isfinite().all()) for values in (common, shared, inside)):
+    color_map = tensors.get("color_map")
+    if color_map is not None and (color_map.shape != (3, 4) or color_map.dtype != torch.float32):
+        raise ValueError("a colour map of another shape")
+    present = (common, shared, inside) if color_map is None else (common, shared, inside, color_map)
+    if not all(bool(values.isfinite().all()) for values in present):
         raise ValueError("embeddings that are no numbers")
     local = shared.repeat(count, 1)
     local[rows.long()] = inside
-    return Embeddings(common.to(outside.device), local.to(outside.device))
+    color_map = None if color_map is None else color_map.to(outside.device)
+    return Embeddings(common.to(outside.device), local.to(outside.device), color_map)
 
 
 def fingerprint(method: Method) -> str:

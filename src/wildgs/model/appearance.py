@@ -18,11 +18,13 @@ class Appearance:
         global_embedding: Emb^g, or None for a method without appearance.
         planes: Triplane feature maps F^T, or None: then every Gaussian's local embedding is the vector v.
         visibility: M of the encoded photo (1 = static), or None for a method without a mask.
+        color_map: What the embedding missed of the photo's colours (`wildgs.model.color_match`), or None.
     """
 
     global_embedding: Float[Tensor, " G"] | None = None
     planes: Float[Tensor, "3 C R R"] | None = None
     visibility: Float[Tensor, "H W"] | None = None
+    color_map: Float[Tensor, "3 4"] | None = None
 
 
 @dataclass(frozen=True)
@@ -32,16 +34,20 @@ class Embeddings:
     Attributes:
         global_embedding: Emb^g.
         local_embeddings: Emb^l per Gaussian.
+        color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none.
     """
 
     global_embedding: Float[Tensor, " G"]
     local_embeddings: Float[Tensor, "N L"]
+    color_map: Float[Tensor, "3 4"] | None = None
 
 
 def blend_embeddings(
     parts: Sequence[Embeddings], weights: Sequence[float], local_weights: Sequence[float] | None = None
 ) -> Embeddings:
     """Tuning: Σ w_k f_k on global and local embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
+
+    Colour maps are of the photo as a whole and mix as global embeddings do.
 
     Args:
         parts: Embeddings for the same Gaussians, at least one.
@@ -52,12 +58,24 @@ def blend_embeddings(
     return Embeddings(
         _weighted([part.global_embedding for part in parts], weights),
         _weighted([part.local_embeddings for part in parts], local_weights),
+        _mixed_maps(parts, weights),
     )
+
+
+def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 4"] | None:
+    """Σ w [A | b], where a part without a map changes nothing."""
+    maps = [(part.color_map, weight) for part, weight in zip(parts, weights, strict=True)]
+    present = [(change, weight) for change, weight in maps if change is not None]
+    if not present:
+        return None
+    return _weighted([change for change, _ in present], [weight for _, weight in present])
 
 
 def _weighted(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
     """Σ w x; what has weight 0 is not looked at."""
     chosen = [(value, weight) for value, weight in zip(values, weights, strict=True) if weight != 0]
+    if not chosen:
+        return torch.zeros_like(values[0])
     total = chosen[0][0] * chosen[0][1]
     for value, weight in chosen[1:]:
         total = torch.add(total, value, alpha=weight)

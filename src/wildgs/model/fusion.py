@@ -73,13 +73,20 @@ class Fusion(MixedModule):
         global_embedding: Float[Tensor, " G"],
         local_embeddings: Float[Tensor, "N L"],
         intrinsic: Float[Tensor, "N I"],
+        color_map: Float[Tensor, "3 4"] | None = None,
     ) -> Float[Tensor, "N K 3"]:
         """SH coefficients of every Gaussian.
 
         The first layer is split: the global embedding's share is the same for all Gaussians and computed once.
+
+        Args:
+            global_embedding: Emb^g.
+            local_embeddings: Emb^l.
+            intrinsic: f^in.
+            color_map: A further change [A | b] of all colours, after the colour transform.
         """
         rows = torch.cat([local_embeddings, intrinsic], dim=1)
-        output, direct, bias = self._last_layers(global_embedding)
+        output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         with self.mixed(rows.device):
             hidden = (self.first_rows(rows) + self.first_global(global_embedding)).relu()
             hidden = self.second(hidden).relu()
@@ -87,20 +94,31 @@ class Fusion(MixedModule):
         # The direct path carries the base colour and stays in full precision.
         return torch.addmm(fused.float(), intrinsic, direct.T).reshape(-1, self.coefficients, 3)
 
+    def _change(
+        self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None
+    ) -> Float[Tensor, "3 4"] | None:
+        """[A | b] of the colour transform and the colour map after it, as one; None where there is neither."""
+        if self.transform is None:
+            return color_map
+        first = self.transform(global_embedding)
+        change = torch.cat([first[:9].reshape(3, 3), first[9:, None]], dim=1)
+        if color_map is None:
+            return change
+        return change + color_map + color_map[:, :3] @ change
+
     def _last_layers(
-        self, global_embedding: Float[Tensor, " G"]
+        self, change: Float[Tensor, "3 4"] | None
     ) -> tuple[Float[Tensor, "O H"], Float[Tensor, "O I"], Float[Tensor, " O"]]:
-        """Weights of the output and the direct path, and their bias, with the colour transform taken in.
+        """Weights of the output and the direct path, and their bias, with a change of colours taken in.
 
         All three are linear, so that colours ``c + A c + b`` cost no pass over the Gaussians.
         """
         output, direct, bias = self.output.weight, self.direct.weight, self.output.bias
-        if self.transform is None:
+        if change is None:
             return output, direct, bias
-        change = self.transform(global_embedding)
-        matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:9].reshape(3, 3)
-        # Harmonics are colours around grey, which the transform moves too.
-        flat = rgb_to_sh0(matrix @ torch.full_like(change[9:], 0.5) + change[9:])
+        matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:, :3]
+        # Harmonics are colours around grey, which the change moves too.
+        flat = rgb_to_sh0(matrix @ torch.full_like(change[:, 3], 0.5) + change[:, 3])
 
         def colors_mapped(weight: Float[Tensor, "O X"]) -> Float[Tensor, "O X"]:
             return (matrix @ weight.reshape(self.coefficients, 3, -1)).reshape(weight.shape)

@@ -1,0 +1,57 @@
+"""Colours matched to a photo: exact where the photo is an affine map of the scene, and hard to fool."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wildgs.model.color_match import LEAST_PIXELS, match_colors
+
+
+def changed(colors: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    return colors + colors @ change[:, :3].T + change[:, 3]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_finds_the_map_that_made_the_photo(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    render = torch.rand(24, 30, 3, generator=generator)
+    change = 0.2 * (torch.rand(3, 4, generator=generator) - 0.5)
+    photo = changed(render, change)
+    found = match_colors(render, photo, torch.ones(24, 30))
+    torch.testing.assert_close(changed(render, found), photo, atol=0.01, rtol=0)
+
+
+def test_weights_of_zero_are_not_looked_at() -> None:
+    render = torch.rand(24, 30, 3, generator=torch.Generator().manual_seed(0))
+    photo, weights = 0.8 * render, torch.ones(24, 30)
+    expected = match_colors(render[:, :15], photo[:, :15], weights[:, :15])
+    photo[:, 15:], weights[:, 15:] = torch.nan, 0
+    torch.testing.assert_close(match_colors(render, photo, weights), expected)
+
+
+def test_passers_by_that_the_mask_missed_count_little() -> None:
+    render = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0))
+    photo = 0.9 * render
+    photo[25:, 25:] = torch.tensor([1.0, 0.0, 1.0])
+    found = changed(render, match_colors(render, photo, torch.ones(40, 40)))
+    assert float((found - 0.9 * render)[:25].abs().max()) < 0.03
+
+
+@pytest.mark.parametrize("colors", [torch.zeros(20, 20, 3), torch.full((20, 20, 3), 1.7)])
+def test_one_colour_says_little_and_breaks_nothing(colors: torch.Tensor) -> None:
+    photo = torch.full_like(colors, 0.4)
+    found = match_colors(colors, photo, torch.ones(20, 20))
+    torch.testing.assert_close(changed(colors.clamp(0, 1), found), photo, atol=0.01, rtol=0)
+    assert float(found.abs().max()) < 1
+
+
+def test_too_few_pixels_and_no_numbers_change_nothing() -> None:
+    render, photo = torch.rand(20, 20, 3), torch.rand(20, 20, 3)
+    weights = torch.zeros(20, 20)
+    weights.view(-1)[: LEAST_PIXELS - 1] = 1
+    assert not match_colors(render, photo, weights).any()
+    assert not match_colors(torch.full_like(render, torch.nan), photo, torch.ones(20, 20)).any()
