@@ -20,7 +20,11 @@ def test_paper_leaves_out_all_that_is_ours() -> None:
         "model.parsing.color_statistics": False,
         "model.fusion.color_transform": False,
         "model.depth_points.points": 0,
+        "model.wrapping.partial_lifts": 0.0,
+        "model.ground.points": 0,
         "model.sky.points": 0,
+        "model.color_match": False,
+        "train.objective.depth_weight": 0.05,
         "train.schedule.encoder_every": 1,
     }
 

@@ -32,7 +32,11 @@ PRESETS: dict[PresetName, Preset] = {
             "model.parsing.color_statistics": False,
             "model.fusion.color_transform": False,
             "model.depth_points.points": 0,
+            "model.wrapping.partial_lifts": 0.0,
+            "model.ground.points": 0,
             "model.sky.points": 0,
+            "model.color_match": False,
+            "train.objective.depth_weight": 0.05,
             "train.schedule.encoder_every": 1,
         }
     ),

@@ -15,12 +15,14 @@ import torch
 from wildgs.config import RunConfig, read_config, to_plain, write_config
 from wildgs.data import Alignment, Scene, load_scene
 from wildgs.data.depth_points import depth_points
+from wildgs.data.ground import ground_points
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
+from wildgs.model.wildgs import ColoredPoints
 
 CONFIG_FILE = "config.yaml"
 CHECKPOINT_FOLDER = "checkpoints"
@@ -181,8 +183,11 @@ def start_training(
     with team.together():
         torch.manual_seed(config.train.seed)
         points, colors = _within_budget(scene, config)
-        dense = _dense_points(scene, config, len(points)) if config.method == "wildgs" else None
-        method = create_method(config.method, config.model, points, colors, dense)
+        dense = ground = None
+        if config.method == "wildgs":
+            dense = _dense_points(scene, config, len(points))
+            ground = _ground_points(scene, config, (points, colors), dense)
+        method = create_method(config.method, config.model, points, colors, dense, ground)
         return Trainer(method.to(device or default_device()), scene, config.train, team)
 
 
@@ -197,6 +202,19 @@ def _dense_points(scene: Scene, config: RunConfig, sparse: int) -> tuple[torch.T
     room = max(0, config.train.density.max_gaussians - sparse - config.model.sky.points) // 2
     wanted = config.model.depth_points
     return depth_points(scene, replace(wanted, points=min(wanted.points, room)), config.train.seed)
+
+
+def _ground_points(
+    scene: Scene, config: RunConfig, sparse: ColoredPoints, dense: ColoredPoints
+) -> ColoredPoints:
+    """Where the ground goes on, no more than half of what the budget leaves for growth."""
+    points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
+    room = max(0, config.train.density.max_gaussians - len(points) - config.model.sky.points) // 2
+    wanted = config.model.ground
+    centers = torch.stack([view.camera.position for view in scene.train_views])
+    return ground_points(
+        points, colors, centers, replace(wanted, points=min(wanted.points, room)), config.train.seed
+    )
 
 
 def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:

@@ -113,6 +113,17 @@ def test_reset_lowers_opacities_and_forgets_their_moments(method: VanillaGS) -> 
     assert state["exp_avg"].abs().sum() == 0
 
 
+def test_reset_leaves_alone_what_no_photo_has_shown(method: VanillaGS) -> None:
+    control, optimizers = controlled(method, [0.0] * 4)
+    optimizers.rows.state[method.gaussians.means]["exp_avg_sq"][1] = 0
+    before = method.gaussians.opacities.detach().clone()
+    assert before[1] > 0.01
+    control.reset_opacity(method.gaussians, optimizers.rows)
+    lowered = before.clamp(max=0.01)
+    lowered[1] = before[1]
+    torch.testing.assert_close(method.gaussians.opacities.detach(), lowered)
+
+
 def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:
     """As 3DGS: the threshold means the same at any resolution."""
     from wildgs.geometry.camera import Camera

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from wildgs.model.appearance import Appearance, blend_embeddings
-from wildgs.model.lifting import lift, liftable
+from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings
+from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.method import Stage
 from wildgs.model.registry import create_method, restore_method
 from wildgs.model.vanilla import VanillaGS
@@ -209,3 +211,55 @@ def test_empty_photo_encodes(camera, make_wall_model) -> None:
         sh = model.shade(model.encode(photo_of(camera), away))
     assert torch.isfinite(sh).all()
     assert isinstance(model, WildGS)
+
+
+def test_colours_are_matched_to_a_photo_of_the_place_alone(camera, make_wall_model) -> None:
+    model = make_wall_model()
+    photo = torch.tensor([0.2, 0.5, 0.9]).expand(camera.height, camera.width, 3).contiguous()
+    matched = model.encode(photo, camera)
+    unmatched = replace(matched, color_map=None)
+    errors = [
+        float((model.render(camera, model.shade(look)).colors - photo).abs().mean().detach())
+        for look in (matched, unmatched)
+    ]
+    assert errors[0] < 0.05 < errors[1]
+    assert model.encode(photo, camera, trust_mask=False).color_map is None
+    model.config = replace(model.config, color_match=False)
+    assert model.encode(photo, camera).color_map is None
+
+
+def test_colour_maps_mix_with_the_global_embedding() -> None:
+    first = Embeddings(torch.zeros(2), torch.zeros(4, 2), torch.ones(3, 4))
+    second = Embeddings(torch.ones(2), torch.ones(4, 2))
+    mixed = blend_embeddings([first, second], [0.25, 0.75], [1.0, 0.0])
+    assert torch.equal(mixed.color_map, torch.full((3, 4), 0.25))
+    assert blend_embeddings([second, second], [0.5, 0.5]).color_map is None
+    assert not blend_embeddings([first, second], [0.0, 1.0]).color_map.any()
+
+
+def test_a_random_part_is_one_side_of_a_cut() -> None:
+    torch.manual_seed(0)
+    shares, kinds = [], set()
+    for _ in range(200):
+        part = random_part(40, 60)
+        rows, columns = part.any(dim=1), part.any(dim=0)
+        assert torch.equal(part, rows[:, None] & columns[None, :])
+        assert int(rows.diff().sum() + columns.diff().sum()) == 1, "one cut"
+        kinds.add((bool(rows.all()), bool(part[0, 0])))
+        shares.append(float(part.float().mean()))
+    assert len(kinds) == 4
+    assert 0.24 < min(shares) < 0.35 < 0.65 < max(shares) < 0.76
+
+
+@pytest.mark.parametrize(("share", "changes"), [(0.0, False), (1.0, True)])
+def test_parts_are_lifted_in_training_alone(share: float, changes: bool, camera, make_wall_model) -> None:
+    model = make_wall_model(partial_lifts=share)
+    photo = photo_of(camera)
+    pictures = []
+    with torch.no_grad():
+        whole = model.encode(photo, camera).planes
+        assert torch.equal(whole, model.encode(photo, camera).planes)
+    for _ in range(3):
+        output = model.training_pass(photo, camera, Stage())
+        pictures.append(output.rendering.colors.detach())
+    assert (not torch.equal(pictures[0], pictures[1]) or not torch.equal(pictures[1], pictures[2])) == changes

@@ -216,7 +216,14 @@ class DensityControl:
 
     @torch.no_grad()
     def reset_opacity(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Lowers all opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned."""
-        ceiling = torch.tensor(self.config.reset_opacity).logit()
-        gaussians.rows["opacity_logits"].clamp_(max=float(ceiling))
+        """Lowers opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned.
+
+        What no photo has shown yet keeps its own: no photo would raise it again.
+        """
+        logits = gaussians.rows["opacity_logits"]
+        lowered = logits.clamp(max=float(torch.tensor(self.config.reset_opacity).logit()))
+        moments = optimizer.state.get(gaussians.means, {}).get("exp_avg_sq")
+        if moments is not None:
+            lowered = torch.where((moments == 0).all(dim=1), logits, lowered)
+        logits.copy_(lowered)
         reset_moments(optimizer, gaussians, "opacity_logits")

@@ -251,13 +251,14 @@ class Trainer:
 
     def _control_density(self, taken: int) -> DensityReport | None:
         report = None
+        # Before densification, whose new Gaussians look as if no photo had ever shown them.
+        if self.schedule.resets(self.step, taken):
+            self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         if self.schedule.densifies(self.step, taken):
             large = self.step > self.schedule.reset_every
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )
-        if self.schedule.resets(self.step, taken):
-            self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         return report
 
     def shrink_to_budget(self) -> int:

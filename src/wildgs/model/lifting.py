@@ -20,6 +20,15 @@ def liftable(
     return covered if visibility is None else covered & (visibility > threshold)
 
 
+def random_part(height: int, width: int) -> Bool[Tensor, "H W"]:
+    """What lies on one side of a straight cut, upright or level, through the middle half of a picture."""
+    place, upright, kept_first = torch.rand(3).tolist()
+    length = width if upright < 0.5 else height
+    first = torch.arange(length) < round((0.25 + 0.5 * place) * length)
+    chosen = first if kept_first < 0.5 else ~first
+    return (chosen[None, :] if upright < 0.5 else chosen[:, None]).expand(height, width)
+
+
 @torch.no_grad()
 def lift(
     photo: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], keep: Bool[Tensor, "H W"], camera: Camera

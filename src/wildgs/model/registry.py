@@ -14,7 +14,7 @@ from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
 from wildgs.model.triplane import Box
 from wildgs.model.vanilla import VanillaGS
-from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.model.wildgs import ColoredPoints, WildGS, WildGSConfig
 
 MethodName = Literal["wildgs", "3dgs"]
 _ROWS = "gaussians.rows."
@@ -25,7 +25,8 @@ def create_method(
     config: WildGSConfig,
     points: Float[Tensor, "P 3"],
     colors: UInt8[Tensor, "P 3"],
-    dense: tuple[Float[Tensor, "D 3"], UInt8[Tensor, "D 3"]] | None = None,
+    dense: ColoredPoints | None = None,
+    ground: ColoredPoints | None = None,
 ) -> Method:
     """A method at its start.
 
@@ -35,10 +36,11 @@ def create_method(
         points: Sparse SfM points in the scene's aligned frame.
         colors: Their colours.
         dense: Further points with colours that `wildgs` alone starts from.
+        ground: Where the ground goes on, likewise.
     """
     if name == "3dgs":
         return VanillaGS.from_points(points, colors)
-    return WildGS.from_points(config, points, colors, dense=dense)
+    return WildGS.from_points(config, points, colors, dense=dense, ground=ground)
 
 
 def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tensor]) -> Method:

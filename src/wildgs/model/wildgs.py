@@ -11,12 +11,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.data.depth_points import DepthPointsConfig
+from wildgs.data.ground import GroundConfig
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.color_match import match_colors
 from wildgs.model.encoder import Encoder
 from wildgs.model.fusion import Fusion, FusionConfig
 from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_points
-from wildgs.model.lifting import lift, liftable
+from wildgs.model.ground import ground_rows
+from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
 from wildgs.model.parsing import Parsing, ParsingConfig
 from wildgs.model.sky import COLOR as SKY_COLOR
@@ -25,6 +28,8 @@ from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, WrappingConfig
 from wildgs.rasterize import Projection, blend
 
+ColoredPoints = tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"]]
+"""Positions in the aligned frame, and 8-bit colours."""
 Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
 """Parts that can be taken away: the paper's five, and the intrinsic and local features."""
 
@@ -40,7 +45,10 @@ class WildGSConfig:
         wrapping: 3D Wrapping.
         fusion: The fusion network.
         depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.
+        ground: Gaussians that continue the ground at the start.
         sky: Gaussians that stand for the sky at the start.
+        color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
+            scene's colours under that are from the photo's. Not in the paper.
     """
 
     without: tuple[Ablation, ...] = ()
@@ -49,7 +57,9 @@ class WildGSConfig:
     wrapping: WrappingConfig = field(default_factory=WrappingConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
+    ground: GroundConfig = field(default_factory=GroundConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
+    color_match: bool = True
 
 
 class WildGS(Method):
@@ -83,7 +93,8 @@ class WildGS(Method):
         points: Float[Tensor, "P 3"],
         colors: UInt8[Tensor, "P 3"],
         encoder: Encoder | None = None,
-        dense: tuple[Float[Tensor, "D 3"], UInt8[Tensor, "D 3"]] | None = None,
+        dense: ColoredPoints | None = None,
+        ground: ColoredPoints | None = None,
     ) -> WildGS:
         """Starts from SfM points and their colours, in the scene's aligned frame.
 
@@ -93,6 +104,7 @@ class WildGS(Method):
             colors: Their colours.
             encoder: Overrides the encoder that `config` names.
             dense: Further points with colours, for Gaussians alone (`wildgs.data.depth_points`).
+            ground: Where the ground goes on (`wildgs.data.ground`).
         """
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(points, config.wrapping.box_quantile, ratio)
@@ -101,6 +113,10 @@ class WildGS(Method):
             points, colors = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
         rows = geometry_from_points(points)
         unit_colors = colors_to_unit(colors)
+        if ground is not None:
+            discs = ground_rows(ground[0], config.ground.spacing)
+            rows = {name: torch.cat([values, discs[name]]) for name, values in rows.items()}
+            unit_colors = torch.cat([unit_colors, colors_to_unit(ground[1])])
         if config.sky.points:
             sky = sky_rows(config.sky, sfm_points)
             rows = {name: torch.cat([values, sky[name]]) for name, values in rows.items()}
@@ -127,15 +143,35 @@ class WildGS(Method):
         *,
         trust_mask: bool = True,
     ) -> Appearance:
-        """Parses the photo, lifts its static pixels by the rendered depth, and builds the triplane."""
+        """Parses the photo, lifts its static pixels by the rendered depth, builds the triplane, matches colours."""
         appearance = self.parse(photo)
         if not trust_mask:
             appearance = replace(appearance, visibility=None)
-        if self._lacks("local"):
-            return appearance
         with torch.no_grad():
             projection = self.gaussians.project(camera)
-        return self.wrap(photo, appearance, projection, keep)
+        if not self._lacks("local"):
+            appearance = self.wrap(photo, appearance, projection, keep)
+        # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
+        if self.config.color_match and trust_mask:
+            appearance = self._match(photo, appearance, projection, keep)
+        return appearance
+
+    @torch.no_grad()
+    def _match(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        appearance: Appearance,
+        projection: Projection,
+        keep: Bool[Tensor, "H W"] | None,
+    ) -> Appearance:
+        """Adds what the appearance's own render of the photo is off by."""
+        colors = paint_visible(self, projection, appearance, self.sh_degree)
+        rendering = blend(projection, colors)
+        static = liftable(appearance.visibility, rendering.alpha, self.mask_threshold)
+        if keep is not None:
+            static = static & keep
+        weights = static.float() if appearance.visibility is None else appearance.visibility * static
+        return replace(appearance, color_map=match_colors(rendering.colors, photo, weights))
 
     def parse(self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""
@@ -167,12 +203,21 @@ class WildGS(Method):
             points, colors = lift(photo, geometry.depth, chosen, projection.camera)
         return replace(appearance, planes=self.wrapping.planes(points, colors))
 
+    def _lifted_in_training(
+        self, photo: Float[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None
+    ) -> Bool[Tensor, "H W"] | None:
+        """The user's own mask; now and then, a random part of the picture alone."""
+        if torch.rand(()) >= self.config.wrapping.partial_lifts:
+            return keep
+        part = random_part(*photo.shape[:2]).to(photo.device)
+        return part if keep is None else keep & part
+
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
         """Carries an appearance to the Gaussians."""
         means = self.gaussians.means if rows is None else self.gaussians.means[rows]
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
-        return Embeddings(appearance.global_embedding, local)
+        return Embeddings(appearance.global_embedding, local, appearance.color_map)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Fuses to spherical harmonics: sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
@@ -181,7 +226,9 @@ class WildGS(Method):
             intrinsic = intrinsic[rows]
         if self._lacks("intrinsic"):
             intrinsic = torch.zeros_like(intrinsic)
-        return self.fusion(embeddings.global_embedding, embeddings.local_embeddings, intrinsic)
+        return self.fusion(
+            embeddings.global_embedding, embeddings.local_embeddings, intrinsic, embeddings.color_map
+        )
 
     def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics under an appearance: sample, embed, fuse."""
@@ -201,6 +248,6 @@ class WildGS(Method):
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
-            appearance = self.wrap(photo, appearance, projection, keep)
+            appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
         return TrainingOutput(blend(projection, colors), projection, appearance.visibility)

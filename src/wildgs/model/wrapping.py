@@ -24,6 +24,9 @@ class WrappingConfig:
         local_size: Length of the local embedding (paper: 16).
         crop_ratio: Share of the robust box's sides that the triplane covers (paper: 0.5).
         box_quantile: Share of SfM points outside the robust box on each side of each axis.
+        partial_lifts: Share of the training steps in which a part of the photo is lifted only. Not in the paper,
+            where every Gaussian that is seen finds its own pixels in the planes, and those that a photo does not
+            show get whatever light comes out.
     """
 
     resolution: int = 128
@@ -32,6 +35,7 @@ class WrappingConfig:
     local_size: int = 16
     crop_ratio: float = 0.5
     box_quantile: float = 0.005
+    partial_lifts: float = 0.5
 
 
 class Wrapping(MixedModule):
