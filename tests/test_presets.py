@@ -19,6 +19,7 @@ def test_paper_leaves_out_all_that_is_ours() -> None:
     assert {path: new for path, (_, new) in changed.items()} == {
         "model.parsing.color_statistics": False,
         "model.fusion.color_transform": False,
+        "model.fusion.sh_degree": 3,
         "model.depth_points.points": 0,
         "model.wrapping.partial_lifts": 0.0,
         "model.ground.points": 0,

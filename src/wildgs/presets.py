@@ -31,6 +31,7 @@ PRESETS: dict[PresetName, Preset] = {
         {
             "model.parsing.color_statistics": False,
             "model.fusion.color_transform": False,
+            "model.fusion.sh_degree": 3,
             "model.depth_points.points": 0,
             "model.wrapping.partial_lifts": 0.0,
             "model.ground.points": 0,

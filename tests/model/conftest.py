@@ -7,6 +7,7 @@ import torch
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
+from wildgs.model.fusion import FusionConfig
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import Ablation, WildGS, WildGSConfig
@@ -36,6 +37,7 @@ def make_wall_model(wall: torch.Tensor):
         torch.manual_seed(0)
         settings = WildGSConfig(
             sky=SkyConfig(points=0),
+            fusion=FusionConfig(sh_degree=3),
             without=without,
             parsing=ParsingConfig(max_side=32),
             wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8), **config),  # type: ignore[arg-type]

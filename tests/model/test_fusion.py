@@ -20,7 +20,7 @@ def inputs(fusion: Fusion, colors: torch.Tensor) -> tuple[torch.Tensor, torch.Te
 
 def test_starts_near_the_points_colours() -> None:
     torch.manual_seed(0)
-    fusion = Fusion(FusionConfig(), 16, 16)
+    fusion = Fusion(FusionConfig(sh_degree=3), 16, 16)
     colors = torch.rand(50, 3)
     sh = fusion(*inputs(fusion, colors)).detach()
     seen = eval_sh(sh, torch.nn.functional.normalize(torch.randn(50, 3), dim=1), 3)
@@ -46,7 +46,7 @@ def test_the_transform_maps_colours_from_every_direction(degree: int) -> None:
 @pytest.mark.parametrize("with_transform", [True, False])
 def test_a_colour_map_acts_after_everything_else(with_transform: bool) -> None:
     torch.manual_seed(0)
-    fusion = Fusion(FusionConfig(color_transform=with_transform), 16, 16)
+    fusion = Fusion(FusionConfig(sh_degree=3, color_transform=with_transform), 16, 16)
     if fusion.transform is not None:
         torch.nn.init.normal_(fusion.transform.weight, std=0.1)
     given = inputs(fusion, torch.rand(50, 3))

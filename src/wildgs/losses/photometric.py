@@ -12,7 +12,7 @@ from wildgs.losses.ssim import ssim
 EVIDENCE_CELLS = 60
 """The mask's evidence is gathered in so many cells along the long side: paving and bricks that the scene has not
 learnt yet, or that are a pixel off, average out; people do not."""
-BRIGHTNESS_SHARE = 0.5
+BRIGHTNESS_SHARE = 0.25
 """Of a difference in brightness against one in colour, squared: light and shadow change the one, people also the
 other."""
 HALF_EVIDENCE = 0.15

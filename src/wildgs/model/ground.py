@@ -8,7 +8,7 @@ from torch import Tensor
 
 WIDTH, THICKNESS = 0.6, 0.1
 """Standard deviations along and across the ground, in units of the spacing: neighbours overlap."""
-OPACITY = 0.5
+OPACITY = 0.7
 
 
 def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tensor]:

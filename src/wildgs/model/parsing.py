@@ -27,8 +27,8 @@ OPPONENTS = ((1 / 3, 1 / 3, 1 / 3), (0.5, -0.5, 0.0), (-0.25, -0.25, 0.5))
 STATISTICS = 2 * len(OPPONENTS)
 STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
-LOGIT_BOUND = 4.0
-"""Of the mask, so that it stays within 0.018 and 0.982: further out no gradient is left to bring it back."""
+LOGIT_BOUND = 6.0
+"""Of the mask, so that it stays within 0.0025 and 0.9975: further out no gradient is left to bring it back."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, WrappingConfig
 from wildgs.rasterize import Projection, blend
 
-ColoredPoints = tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"]]
+ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
 """Positions in the aligned frame, and 8-bit colours."""
 Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
 """Parts that can be taken away: the paper's five, and the intrinsic and local features."""
