@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from wildgs.errors import UserError
@@ -56,14 +57,28 @@ def _strange_tensors(file: Path, look) -> None:
     save_file({"x": torch.zeros(2)}, file, metadata={"wildgs": '{"format": "wildgs-appearance-2"}'})
 
 
-def _rows_out_of_range(file: Path, look) -> None:
-    from safetensors import safe_open
-
+def _rewrite(file: Path, look, change) -> None:
+    """An appearance file of `look`, after `change` has had its tensors."""
     tensors = load_file(save_look(look, file))
     with safe_open(file, framework="pt") as opened:
         metadata = opened.metadata()
-    tensors["rows"][-1] = 10**6
+    change(tensors)
     save_file(tensors, file, metadata=metadata)
+
+
+def _rows_out_of_range(file: Path, look) -> None:
+    def change(tensors) -> None:
+        tensors["rows"][-1] = 10**6
+
+    _rewrite(file, look, change)
+
+
+def _long_color_map(file: Path, look) -> None:
+    _rewrite(file, look, lambda tensors: tensors.update(color_map=torch.zeros(4, 4)))
+
+
+def _color_map_of_no_numbers(file: Path, look) -> None:
+    _rewrite(file, look, lambda tensors: tensors.update(color_map=torch.full((3, 4), torch.nan)))
 
 
 @pytest.mark.parametrize(
@@ -74,6 +89,8 @@ def _rows_out_of_range(file: Path, look) -> None:
         (lambda file, look: save_file({"x": torch.zeros(2)}, file), "no appearance file"),
         (_strange_tensors, "no appearance file"),
         (_rows_out_of_range, "no appearance file"),
+        (_long_color_map, "no appearance file"),
+        (_color_map_of_no_numbers, "no appearance file"),
     ],
 )
 def test_other_files_are_refused(method, look, tmp_path: Path, spoil, words) -> None:
