@@ -198,23 +198,26 @@ def _claim(folder: Path, config: RunConfig) -> None:
 
 
 def _dense_points(scene: Scene, config: RunConfig, sparse: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points from depth priors, no more than half of what the budget leaves for growth."""
-    room = max(0, config.train.density.max_gaussians - sparse - config.model.sky.points) // 2
+    """Points from depth priors."""
     wanted = config.model.depth_points
-    return depth_points(scene, replace(wanted, points=min(wanted.points, room)), config.train.seed)
+    allowed = min(wanted.points, _half_of_the_room(config, sparse))
+    return depth_points(scene, replace(wanted, points=allowed), config.train.seed)
 
 
 def _ground_points(
     scene: Scene, config: RunConfig, sparse: ColoredPoints, dense: ColoredPoints
 ) -> ColoredPoints:
-    """Where the ground goes on, no more than half of what the budget leaves for growth."""
+    """Where the ground goes on."""
     points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
-    room = max(0, config.train.density.max_gaussians - len(points) - config.model.sky.points) // 2
     wanted = config.model.ground
+    allowed = min(wanted.points, _half_of_the_room(config, len(points)))
     centers = torch.stack([view.camera.position for view in scene.train_views])
-    return ground_points(
-        points, colors, centers, replace(wanted, points=min(wanted.points, room)), config.train.seed
-    )
+    return ground_points(points, colors, centers, replace(wanted, points=allowed), config.train.seed)
+
+
+def _half_of_the_room(config: RunConfig, taken: int) -> int:
+    """Half of the Gaussians that the budget leaves beside the sky's and `taken`: growth needs the rest."""
+    return max(0, config.train.density.max_gaussians - taken - config.model.sky.points) // 2
 
 
 def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:

@@ -42,7 +42,7 @@ def test_the_plane_is_found_among_walls(slope: tuple[float, float], seed: int) -
     points = torch.cat([paving(slope, noise=0.01), wall()])
     plane = find_ground(points, cameras(), 0.03, torch.Generator().manual_seed(seed))
     assert plane is not None
-    torch.testing.assert_close(plane.coefficients, torch.tensor([*slope, -0.5]), atol=0.02, rtol=0)
+    torch.testing.assert_close(plane, torch.tensor([*slope, -0.5]), atol=0.02, rtol=0)
 
 
 def test_the_hole_is_filled_and_what_is_known_is_not_doubled() -> None:

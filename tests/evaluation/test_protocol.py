@@ -37,7 +37,11 @@ class Painter(Method):
         assert not torch.is_grad_enabled()
         self.shown.append((photo, camera))
         self.keeps.append(keep)
-        return Appearance(visibility=photo[..., 0].clone() if self.mask else None)
+        return Appearance(visibility=self.visibility(photo))
+
+    def visibility(self, photo):
+        assert not torch.is_grad_enabled()
+        return photo[..., 0].clone() if self.mask else None
 
     def shade(self, appearance, rows=None):
         return torch.zeros(7, 1, 3)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -41,23 +41,6 @@ class GroundConfig:
     tolerance: float = 0.03
 
 
-@dataclass(frozen=True)
-class Plane:
-    """A nearly level plane: ``z = slope_x x + slope_y y + height``.
-
-    Attributes:
-        coefficients: slope_x, slope_y, height.
-        members: Which of the points lie in it.
-    """
-
-    coefficients: Float[Tensor, "3"]
-    members: Bool[Tensor, " P"]
-
-    def heights(self, places: Float[Tensor, "Q 2"]) -> Float[Tensor, " Q"]:
-        """The plane's z at places x, y."""
-        return places @ self.coefficients[:2] + self.coefficients[2]
-
-
 def ground_points(
     points: Float[Tensor, "P 3"],
     colors: UInt8[Tensor, "P 3"],
@@ -83,25 +66,27 @@ def ground_points(
     plane = find_ground(points, centers, config.tolerance, torch.Generator().manual_seed(seed))
     if plane is None:
         return nothing
-    feet, known = centers[:, :2], points[plane.members]
+    members = _members(points, plane[None], config.tolerance)[0]
+    feet, known = centers[:, :2], points[members]
     low, high = feet.min(dim=0).values - config.reach, feet.max(dim=0).values + config.reach
     x, y = (torch.arange(float(low[i]), float(high[i]), config.spacing) for i in range(2))
     places = torch.cartesian_prod(x, y)
     distance = torch.from_numpy(KDTree(feet.numpy()).query(places.numpy())[0])
     gap, nearest = (torch.from_numpy(found) for found in KDTree(known[:, :2].numpy()).query(places.numpy()))
-    chosen: Int[Tensor, " G"] = ((distance < config.reach) & (gap > config.spacing)).nonzero()[:, 0]
+    chosen = ((distance < config.reach) & (gap > config.spacing)).nonzero()[:, 0]
     chosen = chosen[distance[chosen].argsort(stable=True)[: config.points]]
-    heights = plane.heights(places[chosen])
-    return torch.cat([places[chosen], heights[:, None]], dim=1), colors[plane.members][nearest[chosen]]
+    places = places[chosen]
+    return torch.cat([places, (_padded(places) @ plane)[:, None]], dim=1), colors[members][nearest[chosen]]
 
 
 def find_ground(
     points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"], tolerance: float, generator: torch.Generator
-) -> Plane | None:
+) -> Float[Tensor, "3"] | None:
     """The level plane under the cameras in which most points lie (RANSAC, then least squares).
 
     Returns:
-        None where too few points lie in any one plane, or cameras stand below it.
+        a, b and c of ``z = a x + b y + c``; None where too few points lie in any one plane, or cameras stand below
+        it.
     """
     below = points[points[:, 2] < centers[:, 2].median()]
     if len(below) < _LEAST_POINTS:
@@ -109,7 +94,7 @@ def find_ground(
     if len(below) > _MAX_POINTS:
         below = below[torch.randperm(len(below), generator=generator)[:_MAX_POINTS]]
     triples = below[torch.randint(len(below), (_HYPOTHESES, 3), generator=generator)].double()
-    rows = torch.cat([triples[..., :2], torch.ones_like(triples[..., :1])], dim=-1)
+    rows = _padded(triples)
     usable = torch.linalg.det(rows).abs() > 1e-6
     hypotheses = torch.linalg.solve(rows[usable], triples[usable][..., 2]).float()
     hypotheses = hypotheses[hypotheses[:, :2].norm(dim=1) < _STEEPEST]
@@ -121,18 +106,21 @@ def find_ground(
         if int(best.sum()) < _LEAST_POINTS:
             return None
         known = below[best].double()
-        rows = torch.cat([known[:, :2], torch.ones_like(known[:, :1])], dim=1)
-        coefficients = torch.linalg.lstsq(rows, known[:, 2:]).solution[:, 0].float()
-        best = _members(below, coefficients[None], tolerance)[0]
-    plane = Plane(coefficients, _members(points, coefficients[None], tolerance)[0])
-    above = centers[:, 2] > plane.heights(centers[:, :2])
+        plane = torch.linalg.lstsq(_padded(known), known[:, 2:]).solution[:, 0].float()
+        best = _members(below, plane[None], tolerance)[0]
+    above = centers[:, 2] > _padded(centers) @ plane
     if float(best.float().mean()) < _LEAST_SHARE or float(above.float().mean()) < _LEAST_ABOVE:
         return None
     return plane
 
 
+def _padded(points: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 3"]:
+    """(x, y, 1) of points or places: times a plane's coefficients, its height there."""
+    return torch.cat([points[..., :2], torch.ones_like(points[..., :1])], dim=-1)
+
+
 def _members(
     points: Float[Tensor, "P 3"], planes: Float[Tensor, "H 3"], tolerance: float
 ) -> Bool[Tensor, "H P"]:
-    heights = planes[:, :2] @ points[:, :2].T + planes[:, 2:]
-    return (points[:, 2] - heights).abs() < tolerance
+    """Which points lie in each plane."""
+    return (points[:, 2] - planes @ _padded(points).T).abs() < tolerance

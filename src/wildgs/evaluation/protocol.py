@@ -240,7 +240,7 @@ def _score_masks(method: Method, scene: Scene, device: torch.device, threshold: 
         truth = view.read_truth_mask()
         if truth is None:
             continue
-        visibility = method.encode(_read_photo(view, device), view.camera.to(device)).visibility
+        visibility = method.visibility(_read_photo(view, device))
         if visibility is None:
             return None
         score.add(visibility, truth > 127)

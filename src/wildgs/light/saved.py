@@ -40,14 +40,14 @@ def save_look(look: Look, file: Path) -> Path:
     local = look.embeddings.local_embeddings.detach().cpu()
     shared = local.mode(dim=0).values
     rows = (local != shared).any(dim=1).nonzero()[:, 0]
+    color_map = look.embeddings.color_map
     tensors = {
+        "color_map": torch.zeros(3, 4) if color_map is None else color_map.detach().cpu().contiguous(),
         "global_embedding": look.embeddings.global_embedding.detach().cpu().float().contiguous(),
         "shared_local": shared.contiguous(),
         "rows": rows.to(torch.int32),
         "local_embeddings": local[rows].half().contiguous(),
     }
-    if look.embeddings.color_map is not None:
-        tensors["color_map"] = look.embeddings.color_map.detach().cpu().contiguous()
     header = {
         "format": FORMAT,
         "name": look.name,
@@ -93,22 +93,20 @@ def _fitting(method: WildGS, tensors: Mapping[str, Tensor]) -> Embeddings:
     count, outside = len(method.gaussians), method.wrapping.outside
     shared, rows = tensors["shared_local"].float(), tensors["rows"]
     common, inside = tensors["global_embedding"].float(), tensors["local_embeddings"].float()
+    color_map = tensors["color_map"].float()
     if common.shape != (method.fusion.first_global.in_features,) or shared.shape != outside.shape:
         raise ValueError("embeddings of another length")
     if rows.dtype != torch.int32 or rows.dim() != 1 or inside.shape != (len(rows), *outside.shape):
         raise ValueError("rows without embeddings")
     if bool(((rows < 0) | (rows >= count)).any()):
         raise ValueError("rows of no Gaussian")
-    color_map = tensors.get("color_map")
-    if color_map is not None and (color_map.shape != (3, 4) or color_map.dtype != torch.float32):
+    if color_map.shape != (3, 4):
         raise ValueError("a colour map of another shape")
-    present = (common, shared, inside) if color_map is None else (common, shared, inside, color_map)
-    if not all(bool(values.isfinite().all()) for values in present):
+    if not all(bool(values.isfinite().all()) for values in (common, shared, inside, color_map)):
         raise ValueError("embeddings that are no numbers")
     local = shared.repeat(count, 1)
     local[rows.long()] = inside
-    color_map = None if color_map is None else color_map.to(outside.device)
-    return Embeddings(common.to(outside.device), local.to(outside.device), color_map)
+    return Embeddings(common.to(outside.device), local.to(outside.device), color_map.to(outside.device))
 
 
 def fingerprint(method: Method) -> str:

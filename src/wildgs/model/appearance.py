@@ -64,18 +64,16 @@ def blend_embeddings(
 
 def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 4"] | None:
     """Σ w [A | b], where a part without a map changes nothing."""
-    maps = [(part.color_map, weight) for part, weight in zip(parts, weights, strict=True)]
-    present = [(change, weight) for change, weight in maps if change is not None]
+    present = [part.color_map for part in parts if part.color_map is not None]
     if not present:
         return None
-    return _weighted([change for change, _ in present], [weight for _, weight in present])
+    nothing = torch.zeros_like(present[0])
+    return _weighted([nothing if part.color_map is None else part.color_map for part in parts], weights)
 
 
 def _weighted(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
     """Σ w x; what has weight 0 is not looked at."""
     chosen = [(value, weight) for value, weight in zip(values, weights, strict=True) if weight != 0]
-    if not chosen:
-        return torch.zeros_like(values[0])
     total = chosen[0][0] * chosen[0][1]
     for value, weight in chosen[1:]:
         total = torch.add(total, value, alpha=weight)

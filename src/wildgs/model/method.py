@@ -92,6 +92,10 @@ class Method(nn.Module, ABC):
                 are no photo of the place: there is nobody in the way, and everything is unusual.
         """
 
+    def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
+        """M of a photo (RGB in [0, 1]) and nothing else of `encode`; None for a method without a mask."""
+        return None
+
     @abstractmethod
     def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics of the Gaussians under an appearance.

@@ -111,16 +111,14 @@ class WildGS(Method):
         sfm_points, sfm_colors = points, colors_to_unit(colors)
         if dense is not None:
             points, colors = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
-        rows = geometry_from_points(points)
-        unit_colors = colors_to_unit(colors)
+        parts = [(geometry_from_points(points), colors_to_unit(colors))]
         if ground is not None:
-            discs = ground_rows(ground[0], config.ground.spacing)
-            rows = {name: torch.cat([values, discs[name]]) for name, values in rows.items()}
-            unit_colors = torch.cat([unit_colors, colors_to_unit(ground[1])])
+            parts.append((ground_rows(ground[0], config.ground.spacing), colors_to_unit(ground[1])))
         if config.sky.points:
-            sky = sky_rows(config.sky, sfm_points)
-            rows = {name: torch.cat([values, sky[name]]) for name, values in rows.items()}
-            unit_colors = torch.cat([unit_colors, torch.full((config.sky.points, 3), SKY_COLOR)])
+            sky_colors = torch.full((config.sky.points, 3), SKY_COLOR)
+            parts.append((sky_rows(config.sky, sfm_points), sky_colors))
+        rows = {name: torch.cat([part[name] for part, _ in parts]) for name in parts[0][0]}
+        unit_colors = torch.cat([painted for _, painted in parts])
         rows["intrinsic"] = torch.zeros(len(unit_colors), config.fusion.intrinsic_size)
         model = cls(config, Gaussians(rows), box, encoder)
         with torch.no_grad():
@@ -172,6 +170,10 @@ class WildGS(Method):
             static = static & keep
         weights = static.float() if appearance.visibility is None else appearance.visibility * static
         return replace(appearance, color_map=match_colors(rendering.colors, photo, weights))
+
+    def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
+        """M, by 2D Parsing alone."""
+        return self.parse(photo).visibility
 
     def parse(self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""

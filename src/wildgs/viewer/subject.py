@@ -16,7 +16,6 @@ from wildgs.engine.trainer import Trainer
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
 from wildgs.light.look import NEUTRAL, Look, look_of
-from wildgs.light.photos import encode_view
 from wildgs.light.sources import LightSources
 from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
@@ -76,10 +75,13 @@ class Subject:
         """
         return self._find_look(spec if self.relightable else NEUTRAL, like=like)
 
+    def _photo(self, view: View) -> Float[Tensor, "H W 3"]:
+        return view.read_photo().to(self.device).float() / 255
+
     @torch.no_grad()
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
         """M of a photo (1 = static), in main memory; None for a method that predicts no mask."""
-        visibility = encode_view(self.method, view).visibility
+        visibility = self.method.visibility(self._photo(view))
         return None if visibility is None else visibility.float().cpu()
 
     @torch.no_grad()
@@ -133,8 +135,7 @@ class TrainingSubject(Subject):
                 return super().look(spec, like)
             view = match_view(self.views, str(spec)) or match_view(self.views, like or "") or self.views[0]
             with torch.no_grad():
-                photo = view.read_photo().to(self.device).float() / 255
-                return look_of(self.method, self.method.parse(photo), view.name)
+                return look_of(self.method, self.method.parse(self._photo(view)), view.name)
 
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
         """As `Subject.visibility`."""
