@@ -46,7 +46,8 @@ def test_wildgs_separates_lights_that_the_baseline_averages(
 ) -> None:
     errors = {}
     for method in ("wildgs", "3dgs"):
-        trainer = trainer_for(wall_scene, tiny_model, 220, method)
+        # After 220 some seeds still have a ratio of 0.7; after 450, six of six have 0.2 to 0.4.
+        trainer = trainer_for(wall_scene, tiny_model, 450, method)
         trainer.run()
         view = wall_scene.test_views[0]
         photo = view.read_photo().float() / 255

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
 from wildgs.engine.schedule import exponential
+from wildgs.geometry.morton import morton_order
 from wildgs.model.encoder import Encoder
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
@@ -190,10 +191,38 @@ def edit_rows(
         for key, value in state.items():
             if isinstance(value, Tensor) and value.shape == old.shape:
                 state[key] = torch.cat([value[keep], torch.zeros_like(added[name], dtype=value.dtype)])
-        if state:
-            optimizer.state[new] = state
-        group["params"] = [new]
-        gaussians.rows[name] = new
+        _replace_rows(gaussians, optimizer, group, new, state)
+
+
+@torch.no_grad()
+def sort_rows(gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+    """Puts Gaussians that are near in space near in memory, in parameters and optimiser state alike.
+
+    What gathers from the triplane and scatters back to it, a third of the networks' time, then finds most of it in
+    the cache.
+    """
+    order = morton_order(gaussians.means)
+    for group in optimizer.param_groups:
+        old = gaussians.rows[group["name"]]
+        state = optimizer.state.pop(old, {})
+        moved = {
+            key: value[order] if isinstance(value, Tensor) and value.shape == old.shape else value
+            for key, value in state.items()
+        }
+        _replace_rows(gaussians, optimizer, group, nn.Parameter(old[order]), moved)
+
+
+def _replace_rows(
+    gaussians: Gaussians,
+    optimizer: torch.optim.Optimizer,
+    group: dict[str, Any],
+    new: nn.Parameter,
+    state: dict[str, Any],
+) -> None:
+    if state:
+        optimizer.state[new] = state
+    group["params"] = [new]
+    gaussians.rows[group["name"]] = new
 
 
 @torch.no_grad()

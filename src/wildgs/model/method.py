@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
+from wildgs.model.rows import rows_to_shade, take_rows
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
-
-ROWS_STEP = 1024
 
 
 @dataclass(frozen=True)
@@ -135,19 +134,7 @@ def paint_visible(
 ) -> Float[Tensor, "N 3"]:
     """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded."""
     means = method.gaussians.means
-    rows = _rounded_up(projection.visible)
+    rows = rows_to_shade(projection.visible)
     sh = method.shade(appearance, rows)
-    seen = sh_to_colors(means[rows], sh, projection.camera, degree=sh_degree)
+    seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
     return torch.zeros_like(means).index_copy(0, rows, seen)
-
-
-def _rounded_up(visible: Bool[Tensor, "N"]) -> Int[Tensor, " V"]:
-    """Indices of the visible Gaussians, and of a few others for a number that comes up again.
-
-    Libraries prepare, and on CPUs compile, a matrix product for every new shape.
-    """
-    rows = visible.nonzero()[:, 0]
-    missing = min(-len(rows) % ROWS_STEP, len(visible) - len(rows))
-    if missing == 0:
-        return rows
-    return torch.cat([rows, (~visible).nonzero()[:missing, 0]])

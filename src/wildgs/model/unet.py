@@ -28,8 +28,8 @@ class ConvBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "B I H W"]) -> Float[Tensor, "B O H W"]:
         """Features at the same resolution."""
-        x = functional.leaky_relu(self.first(x), 0.1)
-        return functional.leaky_relu(self.second(x), 0.1)
+        x = functional.leaky_relu(self.first(x), 0.1, inplace=True)
+        return functional.leaky_relu(self.second(x), 0.1, inplace=True)
 
 
 class UpBlock(nn.Module):

@@ -11,6 +11,7 @@ from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_points
 from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
+from wildgs.model.rows import take_rows
 from wildgs.rasterize import blend
 
 
@@ -43,8 +44,8 @@ class VanillaGS(Method):
     def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """The stored harmonics."""
         stored = self.gaussians.rows
-        sh = torch.cat([stored["sh0"], stored["shN"]], dim=1)
-        return sh if rows is None else sh[rows]
+        parts = [stored["sh0"], stored["shN"]]
+        return torch.cat(parts if rows is None else [take_rows(part, rows) for part in parts], dim=1)
 
     def training_pass(
         self,
