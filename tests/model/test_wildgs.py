@@ -27,7 +27,7 @@ def test_lifted_pixels_lie_on_the_wall(camera, make_wall_model) -> None:
         geometry = blend(model.gaussians.project(camera), None)
     photo = photo_of(camera)
     keep = liftable(None, geometry.alpha, 0.5)
-    points, colors = lift(photo, geometry.depth, keep, camera)
+    points, colors = (cloud[keep.reshape(-1)] for cloud in lift(photo, geometry.depth, camera))
     assert keep.float().mean() > 0.9
     torch.testing.assert_close(points[:, 2], torch.full_like(points[:, 2], 2.0), atol=0.02, rtol=0)
     assert torch.equal(colors, photo[keep])

@@ -124,8 +124,8 @@ class DensityControl:
             zeros = torch.zeros_like(projection.means2d[:, 0])
             return ScreenStatistics(zeros, zeros, zeros)
         camera = projection.camera
-        half = torch.tensor([camera.width / 2, camera.height / 2]).to(gradient)
-        norm = (gradient * half).norm(dim=-1)
+        x, y = gradient.unbind(1)
+        norm = torch.hypot(x * (camera.width / 2), y * (camera.height / 2))
         return ScreenStatistics(
             gradient_sum=torch.where(projection.visible, norm, 0.0),
             seen=projection.visible.to(norm),

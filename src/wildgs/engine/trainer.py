@@ -13,16 +13,24 @@ from torch import Tensor
 from wildgs.data import Scene, View, scene_extent
 from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
-from wildgs.engine.optimizers import OptimizerConfig, Optimizers
+from wildgs.engine.optimizers import OptimizerConfig, Optimizers, sort_rows
 from wildgs.engine.processor import settle_on_cpu
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
 from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
+from wildgs.engine.upload import upload
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.geometry.camera import Camera
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
-from wildgs.model.precision import Precision, choose_precision, lay_out_channels_last, set_precision
+from wildgs.model.precision import (
+    Precision,
+    choose_precision,
+    lay_out_channels_last,
+    set_precision,
+    switch_replays,
+)
 
 PREPARATION_PHOTOS = 16
 
@@ -35,6 +43,7 @@ class TrainConfig:
         steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
         seed: Of everything random.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
+        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         objective: Loss weights.
         schedule: What happens when.
         optimizer: Learning rates.
@@ -44,6 +53,7 @@ class TrainConfig:
     steps: int = 30_000
     seed: int = 0
     precision: Precision = "auto"
+    cuda_graphs: bool = True
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -128,6 +138,7 @@ class Trainer:
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.guard = StepGuard()
         self._unreadable: set[str] = set()
+        self._cameras: dict[str, Camera] = {}
         self._photos = ""
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
@@ -144,6 +155,7 @@ class Trainer:
                     observer(report)
         finally:
             set_precision(self.method, torch.float32)
+            switch_replays(self.method, False)
 
     def begin(self) -> None:
         """Gets the method ready for `advance`, the same on all ranks; `run` does it by itself.
@@ -161,6 +173,7 @@ class Trainer:
         self.team.share(self.method.state_dict().values())
         self._verify()
         set_precision(self.method, precision)
+        switch_replays(self.method, self.config.cuda_graphs)
 
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""
@@ -229,11 +242,11 @@ class Trainer:
         return True
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
-        photo = view.read_photo().to(self.device).float() / 255
+        photo = upload(view.read_photo(), self.device).float() / 255
         mask = view.read_mask()
-        keep = None if mask is None else mask.to(self.device) > 0
+        keep = None if mask is None else upload(mask, self.device) > 0
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        output = self.method.training_pass(photo, view.camera.to(self.device), stage, keep)
+        output = self.method.training_pass(photo, self._camera(view), stage, keep)
         disparity = view.read_disparity() if self.method.depth_supervised and stage.explicit else None
         losses = total_loss(
             self._objective,
@@ -244,10 +257,16 @@ class Trainer:
             keep=keep,
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
-            disparity=None if disparity is None else disparity.to(self.device),
+            disparity=None if disparity is None else upload(disparity, self.device),
             train_mask=stage.learn_mask,
         )
         return output, losses
+
+    def _camera(self, view: View) -> Camera:
+        """A photo's camera on the device, carried there once."""
+        if view.name not in self._cameras:
+            self._cameras[view.name] = view.camera.to(self.device)
+        return self._cameras[view.name]
 
     def _control_density(self, taken: int) -> DensityReport | None:
         report = None
@@ -259,6 +278,8 @@ class Trainer:
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )
+            if report.cloned or report.split or report.pruned:
+                sort_rows(self.method.gaussians, self.optimizers.rows)
         return report
 
     def shrink_to_budget(self) -> int:
@@ -271,7 +292,8 @@ class Trainer:
             self.team.verify(self.step, {n: v for n, v in self.state().items() if n != "progress.seconds"})
 
     def _prepare(self) -> None:
-        """Shows the method a few photos, spread over the collection."""
+        """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
+        sort_rows(self.method.gaussians, self.optimizers.rows)
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self._is_readable(view)]
         self.method.prepare([view.read_photo().to(self.device).float() / 255 for view in chosen])

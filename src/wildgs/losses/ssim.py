@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
 
 
+@cache
 def gaussian_taps(dtype: torch.dtype, device: torch.device | str = "cpu") -> Float[Tensor, "11"]:
     """The one-dimensional window of 11 taps, sigma 1.5, that sums to 1."""
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float64)

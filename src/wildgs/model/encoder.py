@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from wildgs.data.hub import hub_reachable
 from wildgs.errors import UserError, WildGSWarning
@@ -53,6 +54,11 @@ class FrozenBatchNorm(nn.Module):
             self.running_mean.copy_(mean)
             # What hardly varies (blank photos) is not blown up: every other photo would then be far off.
             self.running_var.copy_(var.where(var > 1e-4 * (1 + mean.square()), 1.0))
+        if x.device.type != "cpu":
+            # One kernel each way; on CPUs it is the slower one.
+            return functional.batch_norm(
+                x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
+            )
         scale = self.weight * (self.running_var + self.eps).rsqrt()
         shift = self.bias - self.running_mean * scale
         return torch.addcmul(shift.to(x.dtype)[:, None, None], x, scale.to(x.dtype)[:, None, None])

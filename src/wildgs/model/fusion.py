@@ -85,11 +85,13 @@ class Fusion(MixedModule):
             intrinsic: f^in.
             color_map: A further change [A | b] of all colours, after the colour transform.
         """
-        rows = torch.cat([local_embeddings, intrinsic], dim=1)
+        # In the precision of the product that reads them: to join them first would cost a copy of both in full.
+        rows = torch.cat([local_embeddings.to(self.precision), intrinsic.to(self.precision)], dim=1)
         output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         with self.mixed(rows.device):
-            hidden = (self.first_rows(rows) + self.first_global(global_embedding)).relu()
-            hidden = self.second(hidden).relu()
+            of_all = self.first_global(global_embedding)
+            hidden = functional.linear(rows, self.first_rows.weight, of_all).relu_()
+            hidden = self.second(hidden).relu_()
             fused = functional.linear(hidden, output, bias)
         # The direct path carries the base colour and stays in full precision.
         return torch.addmm(fused.float(), intrinsic, direct.T).reshape(-1, self.coefficients, 3)

@@ -97,30 +97,40 @@ class Parsing(MixedModule):
         self.mask_head.bias.data.fill_(STATIC_BIAS)  # pyright: ignore[reportOptionalMemberAccess]
 
     def forward(
-        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True
+        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True, learn_mask: bool = True
     ) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
         """Parses one photo.
 
         Args:
             photo: RGB in [0, 1].
-            learn_encoder: Whether gradients reach the encoder; all else here takes them anyway.
+            learn_encoder: Whether gradients reach the encoder.
+            learn_mask: Whether gradients go through the mask.
 
         Returns:
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
-        with self.mixed(photo.device):
-            image = self.shrink(photo)
-            with torch.set_grad_enabled(learn_encoder and torch.is_grad_enabled()):
+        networks = (self.encoder, self.decoder, self.mask_head, self.global_mlp)
+        coarse, embedding = self.replays(
+            self._networks, networks, self.shrink(photo), (learn_encoder, learn_mask)
+        )
+        logits = functional.interpolate(coarse, size=photo.shape[:2], mode="bilinear", align_corners=False)
+        return _Bounded.apply(logits[0, 0]).sigmoid(), embedding
+
+    def _networks(
+        self, image: Float[Tensor, "1 3 h w"], learn_encoder: bool, learn_mask: bool
+    ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
+        """The mask's logits at a quarter of the resolution, and Emb^g."""
+        learning = torch.is_grad_enabled()
+        with self.mixed(image.device):
+            with torch.set_grad_enabled(learning and learn_encoder):
                 features = self.encoder(image)
             x = features[-1]
-            for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
-                x = block(x, skip)
-            coarse = self.mask_head(x)
+            with torch.set_grad_enabled(learning and learn_mask):
+                for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
+                    x = block(x, skip)
+                coarse = self.mask_head(x)
         embedding = self.global_mlp(self._summary(image, features[-1]))[0]
-        logits = functional.interpolate(
-            coarse.float(), size=photo.shape[:2], mode="bilinear", align_corners=False
-        )
-        return _Bounded.apply(logits[0, 0]).sigmoid(), embedding
+        return coarse.float(), embedding
 
     def _summary(self, images: Float[Tensor, "B 3 H W"], deepest: Tensor) -> Float[Tensor, "B S"]:
         """What M^G reads: the average of the deepest features and, where configured, the colour statistics."""

@@ -9,6 +9,8 @@ from typing import Literal
 import torch
 from torch import nn
 
+from wildgs.model.replays import Replays
+
 Precision = Literal["auto", "float32", "bfloat16"]
 
 # oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024 by itself. A collection
@@ -21,14 +23,21 @@ os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
 
 
 class MixedModule(nn.Module):
-    """A network whose forward pass may run in bfloat16."""
+    """A network whose forward pass may run in bfloat16, and be replayed as a CUDA graph."""
 
     precision: torch.dtype = torch.float32
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.replays = Replays()
 
     def mixed(self, device: torch.device) -> AbstractContextManager[object]:
         """Autocast to this module's precision."""
         enabled = self.precision != torch.float32
-        return torch.autocast(device.type, dtype=self.precision if enabled else None, enabled=enabled)
+        dtype = self.precision if enabled else None
+        # Every weight is read once, so nothing is gained by keeping it; and graphs must not be recorded from what
+        # was kept.
+        return torch.autocast(device.type, dtype=dtype, enabled=enabled, cache_enabled=False)
 
 
 def set_precision(module: nn.Module, precision: torch.dtype) -> None:
@@ -36,6 +45,13 @@ def set_precision(module: nn.Module, precision: torch.dtype) -> None:
     for part in module.modules():
         if isinstance(part, MixedModule):
             part.precision = precision
+
+
+def switch_replays(module: nn.Module, on: bool) -> None:
+    """Whether the networks inside a module record and replay CUDA graphs where they run on CUDA."""
+    for part in module.modules():
+        if isinstance(part, MixedModule):
+            part.replays.switch(on)
 
 
 def lay_out_channels_last(module: nn.Module) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -65,7 +65,10 @@ def robust_box(points: Float[Tensor, "P 3"], quantile: float, ratio: float) -> B
 
 
 def project_cloud(
-    points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"], resolution: int
+    points: Float[Tensor, "P 3"],
+    colors: Float[Tensor, "P 3"],
+    resolution: int,
+    keep: Bool[Tensor, " P"] | None = None,
 ) -> Float[Tensor, "3 2 4 R R"]:
     """Orthographic pictures of a coloured cloud: c and c' on XY, YZ and ZX (paper, Triplane Color Creation).
 
@@ -76,35 +79,48 @@ def project_cloud(
         points: Normalised positions; those outside [-1, 1] are left out.
         colors: RGB in [0, 1].
         resolution: Cells per side, R.
+        keep: Which points count; None for all.
 
     Returns:
         Per plane: the picture seen from the positive end of the third axis (c), then from the negative end (c').
         Channels are red, green, blue, validity; empty cells are zero.
     """
     inside = (points.abs() <= 1).all(dim=-1)
-    points, colors = points[inside], colors[inside]
-    pictures = colors.new_zeros(6, PICTURE_CHANNELS, resolution * resolution)
-    if len(points):
-        cells = ((points + 1) * (0.5 * resolution)).long().clamp_(max=resolution - 1)
-        filled = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1).T
-        for plane, (column, row) in enumerate(PLANE_AXES):
-            cell = cells[:, row] * resolution + cells[:, column]
-            height = points[:, VIEW_AXIS[plane]]
-            for reverse, distance in enumerate((-height, height)):
-                hit, winner = _nearest_per_cell(cell, distance, resolution * resolution)
-                pictures[plane * 2 + reverse][:, hit] = filled[:, winner]
-    return pictures.reshape(3, 2, PICTURE_CHANNELS, resolution, resolution)
+    if keep is not None:
+        inside = inside & keep
+    if points.device.type == "cpu":
+        # Elsewhere the host would wait to learn how many they are.
+        points, colors, inside = points[inside], colors[inside], inside[inside]
+    if len(points) == 0:
+        return colors.new_zeros(3, 2, PICTURE_CHANNELS, resolution, resolution)
+    winner, hit = _nearest_per_cell(points, inside, resolution)
+    filled = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
+    pictures = torch.where(hit[:, None], filled.index_select(0, winner), 0.0)
+    return pictures.reshape(3, 2, resolution, resolution, PICTURE_CHANNELS).permute(0, 1, 4, 2, 3)
 
 
-def _nearest_per_cell(cell: Tensor, distance: Float[Tensor, " P"], num_cells: int) -> tuple[Tensor, Tensor]:
-    """Cells that are hit, and the index of the nearest point in each; ties go to the first point."""
+def _nearest_per_cell(
+    points: Float[Tensor, "P 3"], inside: Bool[Tensor, " P"], resolution: int
+) -> tuple[Int[Tensor, " M"], Bool[Tensor, " M"]]:
+    """For all cells of all six pictures the index of the nearest point, and whether there is one.
+
+    Ties go to the first point.
+    """
+    count = resolution * resolution
+    cells = ((points.T + 1) * (0.5 * resolution)).long().clamp_(0, resolution - 1)
+    heights = torch.stack([points[:, axis] for axis in VIEW_AXIS])
+    columns, rows = (torch.stack([cells[axes[i]] for axes in PLANE_AXES]) for i in (0, 1))
+    # Points that do not count share a cell of their own behind the others.
+    cell = torch.where(inside, rows * resolution + columns, count)[:, None].expand(-1, 2, -1)
     # One integer that orders by distance first and by index second makes scatter-min yield the winner itself.
-    ordinal = ((distance + 1) * (2**30 - 1)).long().clamp_(0, 2**31 - 2)
-    key = (ordinal << 32) | torch.arange(len(cell), device=cell.device)
+    distance = torch.stack([1 - heights, 1 + heights], dim=1)
+    ordinal = (distance * (2**30 - 1)).long().clamp_(0, 2**31 - 2)
+    key = (ordinal << 32) | torch.arange(points.shape[0], device=points.device)
     none = torch.iinfo(torch.int64).max
-    best = torch.full((num_cells,), none, device=cell.device).scatter_reduce(0, cell, key, "amin")
-    hit = (best != none).nonzero()[:, 0]
-    return hit, best[hit] & 0xFFFFFFFF
+    best = torch.full((3, 2, count + 1), none, device=points.device).scatter_reduce(2, cell, key, "amin")
+    best = best[..., :count].reshape(-1)
+    hit = best != none
+    return torch.where(hit, best & 0xFFFFFFFF, 0), hit
 
 
 def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
@@ -119,7 +135,8 @@ def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]
     """
     if planes.device.type == "cpu" and planes.dtype == torch.float32:
         return _SampleOnCPU.apply(planes, points)
-    grid = torch.stack([points[:, list(axes)] for axes in PLANE_AXES])
+    x, y, z = points.unbind(1)  # no index lists: each would be carried to a GPU, which is waited for
+    grid = torch.stack([x, y, y, z, z, x], dim=1).reshape(-1, 3, 2).permute(1, 0, 2)
     sampled = functional.grid_sample(
         planes, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False
     )

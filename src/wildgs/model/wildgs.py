@@ -22,6 +22,7 @@ from wildgs.model.ground import ground_rows
 from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
 from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.rows import take_rows
 from wildgs.model.sky import COLOR as SKY_COLOR
 from wildgs.model.sky import SkyConfig, sky_rows
 from wildgs.model.triplane import Box, robust_box
@@ -175,9 +176,11 @@ class WildGS(Method):
         """M, by 2D Parsing alone."""
         return self.parse(photo).visibility
 
-    def parse(self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True) -> Appearance:
+    def parse(
+        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True, learn_mask: bool = True
+    ) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""
-        visibility, embedding = self.parsing(photo, learn_encoder=learn_encoder)
+        visibility, embedding = self.parsing(photo, learn_encoder=learn_encoder, learn_mask=learn_mask)
         if self._lacks("global"):
             embedding = torch.zeros_like(embedding)
         return Appearance(embedding, None, None if self._lacks("mask") else visibility)
@@ -202,8 +205,8 @@ class WildGS(Method):
             chosen = liftable(appearance.visibility, geometry.alpha, self.mask_threshold)
             if keep is not None:
                 chosen = chosen & keep
-            points, colors = lift(photo, geometry.depth, chosen, projection.camera)
-        return replace(appearance, planes=self.wrapping.planes(points, colors))
+            points, colors = lift(photo, geometry.depth, projection.camera)
+        return replace(appearance, planes=self.wrapping.planes(points, colors, chosen.reshape(-1)))
 
     def _lifted_in_training(
         self, photo: Float[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None
@@ -211,12 +214,13 @@ class WildGS(Method):
         """The user's own mask; now and then, a random part of the picture alone."""
         if torch.rand(()) >= self.config.wrapping.partial_lifts:
             return keep
-        part = random_part(*photo.shape[:2]).to(photo.device)
+        height, width = photo.shape[:2]
+        part = random_part(height, width, photo.device)
         return part if keep is None else keep & part
 
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
         """Carries an appearance to the Gaussians."""
-        means = self.gaussians.means if rows is None else self.gaussians.means[rows]
+        means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
         return Embeddings(appearance.global_embedding, local, appearance.color_map)
@@ -225,7 +229,7 @@ class WildGS(Method):
         """Fuses to spherical harmonics: sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
         intrinsic = self.gaussians.rows["intrinsic"]
         if rows is not None:
-            intrinsic = intrinsic[rows]
+            intrinsic = take_rows(intrinsic, rows)
         if self._lacks("intrinsic"):
             intrinsic = torch.zeros_like(intrinsic)
         return self.fusion(
@@ -244,9 +248,7 @@ class WildGS(Method):
         keep: Bool[Tensor, "H W"] | None = None,
     ) -> TrainingOutput:
         """The photo is its own reference; one projection serves the depth pass and the colours."""
-        appearance = self.parse(photo, learn_encoder=stage.learn_encoder)
-        if not stage.learn_mask and appearance.visibility is not None:
-            appearance = replace(appearance, visibility=appearance.visibility.detach())
+        appearance = self.parse(photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask)
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from wildgs.model.precision import MixedModule
+from wildgs.model.rows import rows_to_shade
 from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_planes
 from wildgs.model.unet import UNet, standardize_output
 
@@ -60,7 +61,7 @@ class Wrapping(MixedModule):
         directions = 2 if reverse else 1
         self.unet = UNet(PICTURE_CHANNELS * directions, config.widths, config.features)
         self.local_mlp = nn.Sequential(
-            nn.Linear(config.features, 32), nn.ReLU(), nn.Linear(32, config.local_size)
+            nn.Linear(config.features, 32), nn.ReLU(inplace=True), nn.Linear(32, config.local_size)
         )
         self.outside = nn.Parameter(torch.zeros(config.local_size))
 
@@ -69,13 +70,22 @@ class Wrapping(MixedModule):
         """The AABB that the triplane covers."""
         return Box(self.low, self.high)
 
-    def planes(self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]) -> Float[Tensor, "3 C R R"]:
-        """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates."""
-        pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution)
+    def planes(
+        self,
+        points: Float[Tensor, "P 3"],
+        colors: Float[Tensor, "P 3"],
+        keep: Bool[Tensor, " P"] | None = None,
+    ) -> Float[Tensor, "3 C R R"]:
+        """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates; see `project_cloud`."""
+        pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution, keep)
         if not self.reverse:
             pictures = pictures[:, :1]
-        with self.mixed(points.device):
-            return self.unet(pictures.flatten(1, 2)).float()
+        (planes,) = self.replays(self._networks, (self.unet,), pictures.flatten(1, 2))
+        return planes
+
+    def _networks(self, pictures: Float[Tensor, "3 I R R"]) -> tuple[Float[Tensor, "3 C R R"]]:
+        with self.mixed(pictures.device):
+            return (self.unet(pictures).float(),)
 
     @torch.no_grad()
     def calibrate(self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]) -> None:
@@ -103,7 +113,11 @@ class Wrapping(MixedModule):
         if planes is None:
             return everywhere
         means = means.detach()
-        sampled = sample_planes(planes, self.box.normalize(means))
+        inside = self.box.contains(means)
+        # Of what a photo shows, about half lies outside.
+        rows = rows_to_shade(inside)
+        sampled = sample_planes(planes, self.box.normalize(means[rows]))
         with self.mixed(means.device):
             local = self.local_mlp(sampled)
-        return torch.where(self.box.contains(means)[:, None], local.float(), everywhere)
+        local = torch.where(inside[rows, None], local, self.outside.to(local.dtype))
+        return everywhere.to(local.dtype).index_copy(0, rows, local)

@@ -47,14 +47,14 @@ class _Tiles:
 
 def _finite(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, ...]:
     """The same Gaussians, those that are not finite made transparent, whereupon gsplat culls them."""
-    sound = (
-        means.isfinite().all(-1) & quats.isfinite().all(-1) & scales.isfinite().all(-1) & opacities.isfinite()
-    )
-    row = sound[:, None]
-    upright = torch.tensor([1.0, 0, 0, 0], device=means.device)
+    with torch.no_grad():
+        # Finite where all of its terms are: infinity and NaN survive any addition.
+        sound = (means.sum(-1) + quats.sum(-1) + scales.sum(-1) + opacities).isfinite()
+        row = sound[:, None]
+        turned = row & quats.any(-1, keepdim=True)
     return (
         torch.where(row, means, 0),
-        torch.where(row & (quats != 0).any(-1, keepdim=True), quats, upright),
+        torch.where(turned, quats, 1),
         torch.where(row, scales, 0),
         torch.where(sound, opacities, 0).clamp(max=1),
     )
@@ -90,16 +90,18 @@ def project(
         depths = means.new_zeros(n).index_put((rows,), depths)
         conics = means.new_zeros(n, 3).index_put((rows,), conics)
         reach = torch.zeros(n, 2, dtype=radii.dtype, device=means.device).index_put((rows,), radii)
+        seen = (reach > 0).all(-1)
     else:
         radii, means2d, depths, conics, _ = result
         tiles = _tile_lists(gsplat, camera, means2d, radii, depths)
-        reach = radii[0]
+        # Not [0], whose gradient would be a copy in zeros.
+        reach, means2d, depths, conics = (t.squeeze(0) for t in (radii, means2d, depths, conics))
         # gsplat leaves what is culled unwritten.
         seen = (reach > 0).all(-1)
-        means2d = torch.where(seen[:, None], means2d[0], 0)
-        depths = torch.where(seen, depths[0], 0)
-        conics = torch.where(seen[:, None], conics[0], 0)
-    largest = torch.where((reach > 0).all(-1), reach.amax(-1), 0)
+        means2d = torch.where(seen[:, None], means2d, 0)
+        depths = torch.where(seen, depths, 0)
+        conics = torch.where(seen[:, None], conics, 0)
+    largest = torch.where(seen, reach.amax(-1), 0)
     return _projection(camera, means2d, depths, conics, opacities, largest, tiles, absgrad)
 
 

@@ -1,0 +1,144 @@
+"""CUDA graphs for networks whose inputs come in a few shapes: hundreds of small kernels, launched as one.
+
+Parsing and the triplane's UNet take hundreds of kernels each way that run for microseconds; to launch them one by
+one takes the host longer than the device takes for the whole picture. A graph is recorded for every shape that
+comes up again, by torch's own `torch.cuda.make_graphed_callables`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from wildgs.errors import WildGSWarning
+
+EAGER_CALLS = 2
+"""Calls of one shape before it is recorded: a shape that comes once is not worth it."""
+MOST_GRAPHS = 24
+"""Further shapes go without."""
+TOLERANCE = 0.05
+"""Relative difference, in the Euclidean norm, up to which a graph is taken to do what its network does: bfloat16
+twice over, and kernels that libraries choose otherwise while recording."""
+
+Outputs = tuple[Tensor, ...]
+Network = Callable[..., Outputs]
+
+
+class _Part(nn.Module):
+    """What is recorded: a function of one tensor, and the modules whose parameters get gradients by it."""
+
+    def __init__(self, network: Network, modules: Iterable[nn.Module], settings: Sequence[Any]) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(modules)
+        self.network = network
+        self.settings = settings
+
+    def forward(self, x: Tensor) -> Outputs:
+        return self.network(x, *self.settings)
+
+
+class Replays:
+    """Calls a network, or replays what was recorded of it.
+
+    What a replay gives lies where the next replay of the same shape writes: it is to be used up before.
+
+    Attributes:
+        on: Whether to record at all. Only calls on CUDA that record gradients ever are.
+    """
+
+    def __init__(self) -> None:
+        self.on = False
+        self._calls: dict[Hashable, int] = {}
+        self._graphs: dict[Hashable, Callable[[Tensor], Outputs]] = {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Replays:
+        """A copy of a network has parameters of its own, of which nothing is recorded yet."""
+        copy = Replays()
+        copy.on = self.on
+        return copy
+
+    def switch(self, on: bool) -> None:
+        """Turns recording on or off; off forgets what was recorded."""
+        self.on = on
+        self._calls.clear()
+        self._graphs.clear()
+
+    def __call__(
+        self, network: Network, modules: Sequence[nn.Module], x: Tensor, settings: tuple[Hashable, ...] = ()
+    ) -> Outputs:
+        """``network(x, *settings)``.
+
+        Args:
+            network: From one tensor to several. Launches the same kernels whenever shape and settings are the same,
+                waits for nothing, draws nothing at random.
+            modules: Those that it calls.
+            x: Takes no gradient.
+            settings: What else it is told.
+        """
+        if not (self.on and x.is_cuda and torch.is_grad_enabled()):
+            return network(x, *settings)
+        key = (tuple(x.shape), *settings)
+        if key in self._graphs:
+            return self._graphs[key](x)
+        self._calls[key] = self._calls.get(key, 0) + 1
+        if self._calls[key] <= EAGER_CALLS or len(self._graphs) == MOST_GRAPHS:
+            return network(x, *settings)
+        try:
+            self._graphs[key] = _record(_Part(network, modules, settings), x.detach())
+        except RuntimeError as error:
+            self.switch(False)
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            warnings.warn(
+                f"CUDA graphs cannot be used here ({reason}); training goes on without, a little slower",
+                WildGSWarning,
+                stacklevel=2,
+            )
+            return network(x, *settings)
+        return self._graphs[key](x)
+
+
+def _record(part: _Part, x: Tensor) -> Callable[[Tensor], Outputs]:
+    """A graph of the part at this shape, compared with the part itself once.
+
+    Raises:
+        RuntimeError: It cannot be recorded, or gives other numbers.
+    """
+    wanted = _values_and_gradients(part, x)
+    # The graph keeps its example as the place from which it reads.
+    recorded = torch.cuda.make_graphed_callables(part, (x.clone(),), allow_unused_input=True)
+    graph = cast(Callable[[Tensor], Outputs], recorded)
+    found = _values_and_gradients(graph, x, part.parameters())
+    if not _alike(wanted, found):
+        raise RuntimeError("a replay gives other numbers")
+    return graph
+
+
+def _values_and_gradients(
+    part: Callable[[Tensor], Outputs], x: Tensor, parameters: Iterable[nn.Parameter] | None = None
+) -> list[Tensor | None]:
+    outputs = part(x)
+    if parameters is None:
+        assert isinstance(part, nn.Module)
+        parameters = part.parameters()
+    learnt = [parameter for parameter in parameters if parameter.requires_grad]
+    objective = torch.stack([output.float().square().mean() for output in outputs]).sum()
+    gradients = torch.autograd.grad(objective, learnt, allow_unused=True)
+    return [None if value is None else value.detach().clone() for value in (*outputs, *gradients)]
+
+
+def _alike(wanted: Sequence[Tensor | None], found: Sequence[Tensor | None]) -> bool:
+    """Whether the same are None, and all others differ little, taken together."""
+    if [value is None for value in wanted] != [value is None for value in found]:
+        return False
+    pairs = [
+        (one.float(), two.float())
+        for one, two in zip(wanted, found, strict=True)
+        if one is not None and two is not None
+    ]
+    return all(
+        bool((one - two).norm() <= TOLERANCE * one.norm() + 1e-6 * one.numel() ** 0.5) for one, two in pairs
+    )
