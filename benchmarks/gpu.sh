@@ -107,10 +107,12 @@ from gsplat.cuda._backend import _C
 assert _C is not None, "gsplat has no CUDA code here"'
       ;;
     parity)
-      run parity 90 "$python" -m pytest -q -p no:cacheprovider -m cuda --junitxml "$parts/parity.xml" tests
+      run parity 120 "$python" -m pytest -q -p no:cacheprovider -m cuda --junitxml "$parts/parity.xml" \
+        tests/rasterize tests/model tests/engine
       ;;
     steps)
       run steps 90 "$python" benchmarks/train_step.py --json
+      run steps_eager 45 "$python" benchmarks/train_step.py --json --eager --n 1000000
       ;;
     render)
       run render 40 "$python" benchmarks/rasterize.py --json --backends cuda --n 1000000 --sizes 500x375 1000x750

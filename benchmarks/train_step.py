@@ -2,6 +2,7 @@
 
     python benchmarks/train_step.py                       100k and 1M Gaussians, 500x375 and 1000x750
     python benchmarks/train_step.py --quick               100k Gaussians, 480x360
+    python benchmarks/train_step.py --eager               on CUDA: networks without graphs
     python benchmarks/train_step.py --json                the rows, and nothing else, on stdout
 
 The scene is the demo's landmark with its points multiplied to N; both methods start from the same points and
@@ -178,6 +179,7 @@ def make_trainer(
     device: torch.device,
     model: WildGSConfig,
     team: Team | None = None,
+    graphs: bool = True,
 ) -> Trainer:
     """A trainer at the start of the second stage, with N Gaussians."""
     generator = torch.Generator().manual_seed(0)
@@ -185,7 +187,7 @@ def make_trainer(
     noise = 0.02 * torch.randn(n, 3, generator=generator)
     torch.manual_seed(0)
     method = create_method(name, model, scene.points[source] + noise, scene.point_colors[source])
-    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
+    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n), cuda_graphs=graphs)
     trainer = Trainer(method.to(device), scene, config, team)
     trainer.begin()
     trainer.step = trainer.schedule.first_stage + 1
@@ -195,7 +197,9 @@ def make_trainer(
 def plain_steps(trainers: dict[MethodName, Trainer], count: int) -> dict[MethodName, list[float]]:
     """Milliseconds of steps, the methods taking turns."""
     seconds: dict[MethodName, list[float]] = defaultdict(list)
-    for index in range(count + 2):
+    on_cuda = any(trainer.device.type == "cuda" for trainer in trainers.values())
+    warm_up = 20 if on_cuda else 2  # until every shape of photo has its graph
+    for index in range(count + warm_up):
         for name, trainer in trainers.items():
             rhythm = trainer.config.schedule.encoder_every
             start = time.perf_counter()
@@ -203,7 +207,7 @@ def plain_steps(trainers: dict[MethodName, Trainer], count: int) -> dict[MethodN
                 trainer.advance()
             if trainer.device.type == "cuda":
                 torch.cuda.synchronize()
-            if index >= 2:
+            if index >= warm_up:
                 seconds[name].append(1e3 * (time.perf_counter() - start) / rhythm)
     return seconds
 
@@ -236,9 +240,11 @@ def peak_memory(device: torch.device) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
-def measure(scene: Scene, n: int, count: int, device: torch.device, model: WildGSConfig) -> list[Row]:
+def measure(
+    scene: Scene, n: int, count: int, device: torch.device, model: WildGSConfig, graphs: bool = True
+) -> list[Row]:
     """One row a method."""
-    trainers = {name: make_trainer(name, scene, n, device, model) for name in METHODS}
+    trainers = {name: make_trainer(name, scene, n, device, model, graphs=graphs) for name in METHODS}
     seconds = plain_steps(trainers, count)
     base = median(seconds["3dgs"])
     rows = []
@@ -278,6 +284,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="only the rows, on stdout")
     parser.add_argument("--steps", type=int, default=12, help="timed steps a method")
     parser.add_argument("--n", type=int, help="this many Gaussians alone")
+    parser.add_argument("--eager", action="store_true", help="on CUDA: networks without graphs")
     options = parser.parse_args()
     device = default_device()
     sizes = ((480, 360),) if options.quick else SIZES
@@ -287,7 +294,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             scene = make_scene(Path(folder) / "scene", width)
             for n in counts:
-                rows += measure(scene, n, options.steps, device, WildGSConfig())
+                rows += measure(scene, n, options.steps, device, WildGSConfig(), graphs=not options.eager)
                 if not options.json:
                     show(rows[-len(METHODS) :])
     if options.json:

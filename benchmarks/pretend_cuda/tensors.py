@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import traceback
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any
 from unittest.mock import patch
 
@@ -19,12 +20,36 @@ from torch.utils._pytree import tree_flatten, tree_map
 CUDA = torch.device("cuda", 0)
 FREE = frozenset(
     (
-        "view", "_unsafe_view", "permute", "transpose", "t", "expand", "slice", "select", "unsqueeze",
-        "squeeze", "detach", "alias", "as_strided", "unbind", "split", "split_with_sizes", "reshape",
-        "_reshape_alias", "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "lift_fresh", "diagonal",
-        "unfold", "resize_", "_local_scalar_dense",
+        "view",
+        "_unsafe_view",
+        "permute",
+        "transpose",
+        "t",
+        "expand",
+        "slice",
+        "select",
+        "unsqueeze",
+        "squeeze",
+        "detach",
+        "alias",
+        "as_strided",
+        "unbind",
+        "split",
+        "split_with_sizes",
+        "reshape",
+        "_reshape_alias",
+        "empty",
+        "empty_like",
+        "empty_strided",
+        "new_empty",
+        "new_empty_strided",
+        "lift_fresh",
+        "diagonal",
+        "unfold",
+        "resize_",
+        "_local_scalar_dense",
     )
-)  # fmt: skip
+)
 """Operations that launch nothing."""
 COUNTING = frozenset(("nonzero", "masked_select", "repeat_interleave", "_unique2", "equal", "is_nonzero"))
 """Operations after which the host waits: for the size of the result, or for the result."""
@@ -206,6 +231,9 @@ class _Graph(torch.autograd.Function):
             outputs = graph.function(graph.x)
             if not graph.outputs:
                 graph.outputs = [output.detach().clone() for output in outputs]
+            for other in graph.sharing:
+                for kept in other.outputs:
+                    kept.fill_(torch.nan)  # as good as anything: its memory is another's now
             for kept, output in zip(graph.outputs, outputs, strict=True):
                 kept.copy_(output.detach())
         ctx.outputs, ctx.parameters = outputs, parameters
@@ -233,13 +261,25 @@ class _Graph(torch.autograd.Function):
 class _Recorded:
     function: Callable[[Tensor], tuple[Tensor, ...]]
     x: Tensor
+    sharing: list[_Recorded]
     outputs: list[Tensor] = field(default_factory=list)
 
 
-def _make_graphed_callables(part: Any, sample: tuple[Tensor], allow_unused_input: bool = False) -> Any:
-    """Like `torch.cuda.make_graphed_callables` for one input: what comes out is overwritten by the next replay."""
+_POOLS: dict[Any, list[_Recorded]] = defaultdict(list)
+_pool_numbers = count(1)
+
+
+def _make_graphed_callables(
+    part: Any, sample: tuple[Tensor], *, allow_unused_input: bool = False, pool: Any = None
+) -> Any:
+    """Like `torch.cuda.make_graphed_callables` for one input: what comes out is overwritten by the next replay.
+
+    Of another graph with the same memory, too.
+    """
     RECORD.graphs += 1
-    graph, parameters = _Recorded(part.forward, sample[0]), tuple(part.parameters())
+    sharing = _POOLS[pool]
+    graph, parameters = _Recorded(part.forward, sample[0], sharing), tuple(part.parameters())
+    sharing.append(graph)
     return lambda x: _Graph.apply(graph, x, *parameters)
 
 
@@ -283,6 +323,7 @@ def pretend() -> Iterator[Record]:
             (torch.cuda, "max_memory_allocated", lambda *_: 0),
             (torch.cuda, "empty_cache", lambda: None),
             (torch.cuda, "get_device_name", lambda *_: "no GPU, pretended"),
+            (torch.cuda, "graph_pool_handle", lambda: (0, next(_pool_numbers))),
             (torch.cuda, "make_graphed_callables", _make_graphed_callables),
             (backend, "_gsplat", lambda: gsplat),
         ):

@@ -44,7 +44,8 @@ class _Part(nn.Module):
 class Replays:
     """Calls a network, or replays what was recorded of it.
 
-    What a replay gives lies where the next replay of the same shape writes: it is to be used up before.
+    All of one network's graphs share their memory. What a replay gives, gradients included, is to be used up before
+    the next one, of whatever shape.
 
     Attributes:
         on: Whether to record at all. Only calls on CUDA that record gradients ever are.
@@ -54,6 +55,7 @@ class Replays:
         self.on = False
         self._calls: dict[Hashable, int] = {}
         self._graphs: dict[Hashable, Callable[[Tensor], Outputs]] = {}
+        self._memory: Any = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Replays:
         """A copy of a network has parameters of its own, of which nothing is recorded yet."""
@@ -61,11 +63,17 @@ class Replays:
         copy.on = self.on
         return copy
 
+    @property
+    def recorded(self) -> int:
+        """How many graphs there are."""
+        return len(self._graphs)
+
     def switch(self, on: bool) -> None:
         """Turns recording on or off; off forgets what was recorded."""
         self.on = on
         self._calls.clear()
         self._graphs.clear()
+        self._memory = None
 
     def __call__(
         self, network: Network, modules: Sequence[nn.Module], x: Tensor, settings: tuple[Hashable, ...] = ()
@@ -88,7 +96,8 @@ class Replays:
         if self._calls[key] <= EAGER_CALLS or len(self._graphs) == MOST_GRAPHS:
             return network(x, *settings)
         try:
-            self._graphs[key] = _record(_Part(network, modules, settings), x.detach())
+            self._memory = self._memory or torch.cuda.graph_pool_handle()
+            self._graphs[key] = _record(_Part(network, modules, settings), x.detach(), self._memory)
         except RuntimeError as error:
             self.switch(False)
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -101,7 +110,7 @@ class Replays:
         return self._graphs[key](x)
 
 
-def _record(part: _Part, x: Tensor) -> Callable[[Tensor], Outputs]:
+def _record(part: _Part, x: Tensor, memory: Any) -> Callable[[Tensor], Outputs]:
     """A graph of the part at this shape, compared with the part itself once.
 
     Raises:
@@ -109,7 +118,7 @@ def _record(part: _Part, x: Tensor) -> Callable[[Tensor], Outputs]:
     """
     wanted = _values_and_gradients(part, x)
     # The graph keeps its example as the place from which it reads.
-    recorded = torch.cuda.make_graphed_callables(part, (x.clone(),), allow_unused_input=True)
+    recorded = torch.cuda.make_graphed_callables(part, (x.clone(),), allow_unused_input=True, pool=memory)
     graph = cast(Callable[[Tensor], Outputs], recorded)
     found = _values_and_gradients(graph, x, part.parameters())
     if not _alike(wanted, found):
