@@ -71,7 +71,7 @@ def time_steps(trainer: Trainer, count: int) -> float:
 
 def time_exchange(trainer: Trainer, count: int) -> tuple[float, float]:
     """Median milliseconds of the exchange once all processes are there, and its megabytes."""
-    output, losses = trainer._forward(trainer._next_view())
+    output, losses = trainer._forward(trainer.feed.next_view())
     losses.total.backward()
     statistics = trainer.density.measure(output.projection)
     gradients = [p.grad for p in trainer.method.parameters() if p.grad is not None]

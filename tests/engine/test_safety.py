@@ -117,7 +117,7 @@ def test_no_photo_left_is_a_users_mistake(wall_scene: Scene, monkeypatch) -> Non
         raise UserError("no such file")
 
     trainer = trainer_for(wall_scene, 20)
-    trainer.views = tuple(replace(view, read_photo=gone) for view in trainer.views)
+    trainer.feed.views = tuple(replace(view, read_photo=gone) for view in trainer.views)
     monkeypatch.setattr(trainer, "_prepare", lambda: None)
     with pytest.warns(WildGSWarning), pytest.raises(UserError, match="no photo can be read any more"):
         trainer.run()

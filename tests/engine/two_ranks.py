@@ -52,7 +52,7 @@ def first_gradients(output: Path, team: Team) -> None:
     for method in METHODS:
         together = trainer_for(method, team, ScheduleConfig(first_stage=0))
         together.begin()
-        rendered, losses = together._forward(together._next_view())
+        rendered, losses = together._forward(together.feed.next_view())
         losses.total.backward()
         mean = team.average(together.method.parameters(), losses)
         together.density.gather(rendered.projection, team.pool)

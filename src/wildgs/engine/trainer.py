@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from wildgs.data import Scene, View, scene_extent
-from wildgs.data.image_cache import AHEAD
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
+from wildgs.engine.feed import PhotoFeed
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers, sort_rows
 from wildgs.engine.processor import settle_on_cpu
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
 from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
-from wildgs.engine.upload import upload
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.geometry.camera import Camera
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
 from wildgs.model.method import Method, TrainingOutput
 from wildgs.model.precision import (
@@ -136,10 +134,8 @@ class Trainer:
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
+        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device)
         self.guard = StepGuard()
-        self._unreadable: set[str] = set()
-        self._cameras: dict[str, Camera] = {}
-        self._photos = ""
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -178,12 +174,12 @@ class Trainer:
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""
         start = time.perf_counter()
-        view = self._next_view()
+        view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
-        fault = self.guard.judge(self._photos, losses, self.method.parameters())
+        fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
         if fault is None:
             if self.schedule.gathers(self.step):
                 self.density.gather(output.projection, self.team.pool)
@@ -202,52 +198,11 @@ class Trainer:
         count = len(self.method.gaussians)
         return StepReport(self.step, view, losses, output, count, density, self.seconds, fault, taken)
 
-    def _next_view(self) -> View:
-        """The next photo that can be read; those after it are decoded in the background meanwhile.
-
-        Raises:
-            UserError: None can be read any more.
-        """
-        for index in self._candidates():
-            view = self.views[index]
-            if self._is_readable(view):
-                return view
-        raise UserError(
-            f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
-        )
-
-    def _candidates(self) -> Iterator[int]:
-        """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
-        size, rank = self.team.size, self.team.rank
-        for _ in range(len(self.views)):
-            batch = self.sampler.take(size)
-            self._photos = ", ".join(self.views[index].name for index in batch)
-            for index in self.sampler.upcoming(AHEAD * size)[rank::size]:
-                self.views[index].prefetch()
-            yield batch[rank]
-            if size > 1:
-                following = range(batch[rank] + 1, batch[rank] + len(self.views))
-                yield from (i % len(self.views) for i in following if i % len(self.views) not in batch)
-                return
-
-    def _is_readable(self, view: View) -> bool:
-        """Whether a photo can still be read; warns once where it cannot."""
-        try:
-            view.read_photo()
-        except UserError as error:
-            if view.name not in self._unreadable:
-                self._unreadable.add(view.name)
-                warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
-            return False
-        return True
-
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
-        photo = upload(view.read_photo(), self.device).float() / 255
-        mask = view.read_mask()
-        keep = None if mask is None else upload(mask, self.device) > 0
+        photo, keep = self.feed.photo(view), self.feed.keep(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        output = self.method.training_pass(photo, self._camera(view), stage, keep)
-        disparity = view.read_disparity() if self.method.depth_supervised and stage.explicit else None
+        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep)
+        supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
             self._objective,
             self.schedule.progress(self.step),
@@ -257,16 +212,10 @@ class Trainer:
             keep=keep,
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
-            disparity=None if disparity is None else upload(disparity, self.device),
+            disparity=self.feed.disparity(view) if supervised else None,
             train_mask=stage.learn_mask,
         )
         return output, losses
-
-    def _camera(self, view: View) -> Camera:
-        """A photo's camera on the device, carried there once."""
-        if view.name not in self._cameras:
-            self._cameras[view.name] = view.camera.to(self.device)
-        return self._cameras[view.name]
 
     def _control_density(self, taken: int) -> DensityReport | None:
         report = None
@@ -295,8 +244,8 @@ class Trainer:
         """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
         sort_rows(self.method.gaussians, self.optimizers.rows)
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
-        chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self._is_readable(view)]
-        self.method.prepare([view.read_photo().to(self.device).float() / 255 for view in chosen])
+        chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
+        self.method.prepare([self.feed.photo(view) for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to go on exactly, as flat tensors."""

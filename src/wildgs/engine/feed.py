@@ -1,0 +1,102 @@
+"""What a step trains on: the next photo that can be read, and what belongs to it, on the device."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wildgs.data import View
+from wildgs.data.image_cache import AHEAD
+from wildgs.engine.sampler import ViewSampler
+from wildgs.engine.team import Team
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.geometry.camera import Camera
+
+
+class PhotoFeed:
+    """Photos in the order of training, for one rank of a team.
+
+    Attributes:
+        batch: Names of the photos that all ranks train on now.
+    """
+
+    def __init__(self, views: Sequence[View], sampler: ViewSampler, team: Team, device: torch.device) -> None:
+        self.views = views
+        self.sampler = sampler
+        self.team = team
+        self.device = device
+        self.batch = ""
+        self._unreadable: set[str] = set()
+        self._cameras: dict[str, Camera] = {}
+
+    def next_view(self) -> View:
+        """The next photo that can be read; those after it are decoded in the background meanwhile.
+
+        Raises:
+            UserError: None can be read any more.
+        """
+        for index in self._candidates():
+            view = self.views[index]
+            if self.is_readable(view):
+                return view
+        raise UserError(
+            f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
+        )
+
+    def _candidates(self) -> Iterator[int]:
+        """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
+        size, rank = self.team.size, self.team.rank
+        for _ in range(len(self.views)):
+            batch = self.sampler.take(size)
+            self.batch = ", ".join(self.views[index].name for index in batch)
+            for index in self.sampler.upcoming(AHEAD * size)[rank::size]:
+                self.views[index].prefetch()
+            yield batch[rank]
+            if size > 1:
+                following = range(batch[rank] + 1, batch[rank] + len(self.views))
+                yield from (i % len(self.views) for i in following if i % len(self.views) not in batch)
+                return
+
+    def is_readable(self, view: View) -> bool:
+        """Whether a photo can still be read; warns once where it cannot."""
+        try:
+            view.read_photo()
+        except UserError as error:
+            if view.name not in self._unreadable:
+                self._unreadable.add(view.name)
+                warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+            return False
+        return True
+
+    def photo(self, view: View) -> Float[Tensor, "H W 3"]:
+        """RGB in [0, 1]."""
+        return self._upload(view.read_photo()).float() / 255
+
+    def keep(self, view: View) -> Bool[Tensor, "H W"] | None:
+        """The user's own mask, where there is one."""
+        mask = view.read_mask()
+        return None if mask is None else self._upload(mask) > 0
+
+    def disparity(self, view: View) -> Float[Tensor, "H W"] | None:
+        """The depth prior, where there is one."""
+        disparity = view.read_disparity()
+        return None if disparity is None else self._upload(disparity)
+
+    def camera(self, view: View) -> Camera:
+        """The camera, carried to the device once."""
+        if view.name not in self._cameras:
+            self._cameras[view.name] = view.camera.to(self.device)
+        return self._cameras[view.name]
+
+    def _upload(self, tensor: Tensor) -> Tensor:
+        """A tensor in main memory, on the device.
+
+        A copy from pageable memory would wait until the device has done all that it was told before.
+        """
+        if self.device.type == "cpu":
+            return tensor
+        return tensor.pin_memory().to(self.device, non_blocking=True)
