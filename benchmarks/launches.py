@@ -2,6 +2,7 @@
 
     python benchmarks/launches.py                     3,000 Gaussians at 128x96: counts depend little on sizes
     python benchmarks/launches.py --n 1000000 --width 1000        bytes do
+    python benchmarks/launches.py --eager             networks without graphs
     python benchmarks/launches.py --json
 
 The step is the one of CUDA (gsplat, mixed precision, graphs), on `pretend_cuda`'s device; gsplat's functions count
@@ -28,7 +29,7 @@ import torch
 from train_step import METHODS, make_scene, make_trainer
 from wildgs.model.wildgs import WildGSConfig
 
-EAGER_STEPS = 24
+FIRST_STEPS = 24
 """Steps after which all graphs are recorded: every shape of the scene has come often enough."""
 
 
@@ -55,7 +56,7 @@ class Count:
     by_operation: dict[str, float]
 
 
-def count(n: int, width: int, eager_steps: int) -> list[Count]:
+def count(n: int, width: int, first_steps: int, graphs: bool) -> list[Count]:
     """Both methods."""
     counts = []
     with tempfile.TemporaryDirectory() as folder:
@@ -63,8 +64,8 @@ def count(n: int, width: int, eager_steps: int) -> list[Count]:
         for method in METHODS:
             with pretend_cuda.device() as record:
                 before = record.graphs
-                trainer = make_trainer(method, scene, n, torch.device("cuda"), WildGSConfig())
-                for _ in range(eager_steps):
+                trainer = make_trainer(method, scene, n, torch.device("cuda"), WildGSConfig(), graphs=graphs)
+                for _ in range(first_steps):
                     trainer.advance()
                 record.clear()
                 for _ in range(2):
@@ -98,11 +99,12 @@ def main() -> None:
     )
     parser.add_argument("--n", type=int, default=3000, help="Gaussians")
     parser.add_argument("--width", type=int, default=128, help="of the photos' long side")
-    parser.add_argument("--eager-steps", type=int, default=EAGER_STEPS, help="steps before those that count")
+    parser.add_argument("--first-steps", type=int, default=FIRST_STEPS, help="before those that count")
+    parser.add_argument("--eager", action="store_true", help="networks without graphs")
     parser.add_argument("--json", action="store_true", help="only the counts, on stdout")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    counts = count(options.n, options.width, options.eager_steps)
+    counts = count(options.n, options.width, options.first_steps, not options.eager)
     if options.json:
         json.dump([asdict(each) for each in counts], sys.stdout, indent=1)
     else:
