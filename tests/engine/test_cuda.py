@@ -19,9 +19,9 @@ from wildgs.model.wildgs import WildGS, WildGSConfig
 pytestmark = [pytest.mark.cuda, pytest.mark.filterwarnings("ignore:no ImageNet weights")]
 
 CONFIG = TrainConfig(
-    steps=120, precision="float32", density=DensityConfig(grow_gradient=1e-5, max_gaussians=900)
+    steps=60, precision="float32", density=DensityConfig(grow_gradient=1e-5, max_gaussians=900)
 )
-STEPS = 50
+STEPS = 30
 
 
 def trainer_on(
@@ -50,17 +50,16 @@ def test_training_goes_as_on_the_cpu(wall_scene: Scene, tiny_model: WildGSConfig
     # Convolutions round to TF32 on GPUs, and differences grow from step to step; what is learnt stays.
     assert found[:2] == pytest.approx(wanted[:2], rel=2e-3)
     assert found[:10] == pytest.approx(wanted[:10], rel=0.05)
-    assert sum(found[-20:]) == pytest.approx(sum(wanted[-20:]), rel=0.25)
+    assert sum(found[-15:]) == pytest.approx(sum(wanted[-15:]), rel=0.25)
     assert len(cuda.method.gaussians) == len(cpu.method.gaussians) > len(wall_scene.points)
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_graphs_change_nothing_but_speed(wall_scene: Scene, tiny_model: WildGSConfig, precision):
+def test_graphs_change_nothing_but_speed(wall_scene: Scene, tiny_model: WildGSConfig):
     found = {}
     for graphs in (False, True):
-        config = replace(CONFIG, precision=precision, cuda_graphs=graphs)
+        config = replace(CONFIG, precision="bfloat16", cuda_graphs=graphs)
         trainer = trainer_on("cuda", wall_scene, tiny_model, config=config)
-        found[graphs] = losses_of(trainer, 32)
+        found[graphs] = losses_of(trainer, 22)
         method = trainer.method
         assert isinstance(method, WildGS)
         assert (method.parsing.replays.recorded > 0) is graphs
@@ -71,7 +70,7 @@ def test_graphs_change_nothing_but_speed(wall_scene: Scene, tiny_model: WildGSCo
 
 def test_a_state_of_cuda_goes_on_there_and_opens_on_the_cpu(wall_scene: Scene, tiny_model: WildGSConfig):
     trainer = trainer_on("cuda", wall_scene, tiny_model)
-    losses_of(trainer, 30)
+    losses_of(trainer, 16)
     kept = {name: value.detach().cpu().clone() for name, value in trainer.state().items()}
     pictures, further = {}, {}
     for device in ("cpu", "cuda"):
@@ -86,7 +85,7 @@ def test_a_state_of_cuda_goes_on_there_and_opens_on_the_cpu(wall_scene: Scene, t
         resumed = Trainer(method, wall_scene, CONFIG)
         resumed.restore(state)
         resumed.begin()
-        further[device] = losses_of(resumed, 20)
+        further[device] = losses_of(resumed, 10)
     torch.testing.assert_close(pictures["cuda"], pictures["cpu"], atol=5e-3, rtol=0)
     assert further["cuda"][:2] == pytest.approx(further["cpu"][:2], rel=0.01)
     assert sum(further["cuda"]) == pytest.approx(sum(further["cpu"]), rel=0.2)
