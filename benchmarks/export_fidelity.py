@@ -23,7 +23,6 @@ import torch
 
 from wildgs import api
 from wildgs.cli.webpage import baked, page_looks, viewpoints_of
-from wildgs.data import View
 from wildgs.export.formats import SplatFormat, write_splats
 from wildgs.export.page_scene import pack_scene
 from wildgs.export.splats import Splats
@@ -31,6 +30,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.sh_cut import cut_sh, fit_cut
 from wildgs.model.gaussians import NEAR
 from wildgs.rasterize import rasterize
+from wildgs.scene import View
 
 KINDS: tuple[SplatFormat, ...] = ("ply", "compressed.ply", "spz", "splat", "sog")
 

@@ -107,9 +107,9 @@ def _scene(kind: str) -> Callable[[Path], list[str]]:
 
 
 def _read_scene(folder: Path) -> object:
-    from wildgs.data import DataConfig
-    from wildgs.data.colmap import read_model
-    from wildgs.data.undistort import PixelGrid
+    from wildgs.scene import DataConfig
+    from wildgs.scene.colmap import read_model
+    from wildgs.scene.undistort import PixelGrid
 
     model = read_model(folder)
     limit = DataConfig().max_image_pixels
@@ -142,7 +142,7 @@ def _infer_camera(folder: Path) -> object:
     """As `wildgs sfm` does: COLMAP gets what Pillow could read."""
     import pycolmap
 
-    from wildgs.data.images import read_photo
+    from wildgs.scene.images import read_photo
 
     _tolerate(
         lambda: read_photo(folder / "photo.jpg") and pycolmap.infer_camera_from_image(folder / "photo.jpg")
@@ -168,7 +168,7 @@ def _pictures(folder: Path) -> list[str]:
 
 
 def _read_pictures(folder: Path) -> object:
-    from wildgs.data.images import read_disparity, read_mask, read_photo
+    from wildgs.scene.images import read_disparity, read_mask, read_photo
 
     limit = 10_000_000
     for path in folder.iterdir():
@@ -182,7 +182,7 @@ def _read_pictures(folder: Path) -> object:
 
 
 def _tolerate(action: Callable[[], object]) -> None:
-    from wildgs.data.images import UnreadableImageError
+    from wildgs.scene.images import UnreadableImageError
 
     with contextlib.suppress(UnreadableImageError):
         action()
@@ -195,7 +195,7 @@ def _split(folder: Path) -> list[str]:
 
 
 def _read_split(folder: Path) -> object:
-    from wildgs.data.phototourism import assign_splits
+    from wildgs.scene.split import assign_splits
 
     return assign_splits([f"p{i}.png" for i in range(9)], folder, 8)
 

@@ -3,8 +3,8 @@
 #
 #     benchmarks/gpu.sh [--scene DIR] [--wheels DIR] [--lpips DIR] [--output DIR] [--budget SECONDS] [STAGE...]
 #
-# Stages, in this order: install build parity steps render train eval; all of them where none is named. Each has a limit
-# and leaves its log; what fails or runs out of time is in the JSON with its exit code (124: out of time) and the rest
+# Stages, in this order: install build parity steps render train eval eager; all of them where none is named. Each has
+# a limit and leaves its log; what fails or runs out of time is in the JSON with its exit code (124: out of time) and the rest
 # goes on. Training that runs out of time saves; a second call with `train eval` and the same OUTPUT goes on with it.
 #
 # --wheels: a folder with wheels of what the machine lacks, for machines without a package index:
@@ -31,7 +31,7 @@ while [ $# -gt 0 ]; do
     *) stages+=("$1"); shift ;;
   esac
 done
-[ ${#stages[@]} -gt 0 ] || stages=(install build parity steps render train eval)
+[ ${#stages[@]} -gt 0 ] || stages=(install build parity steps render train eval eager)
 
 python=${PYTHON:-python3}
 steps=${STEPS:-30000}
@@ -112,7 +112,6 @@ assert _C is not None, "gsplat has no CUDA code here"'
       ;;
     steps)
       run steps 90 "$python" benchmarks/train_step.py --json
-      run steps_eager 45 "$python" benchmarks/train_step.py --json --eager --n 1000000
       ;;
     render)
       run render 40 "$python" benchmarks/rasterize.py --json --backends cuda --n 1000000 --sizes 500x375 1000x750
@@ -129,6 +128,9 @@ assert _C is not None, "gsplat has no CUDA code here"'
       ;;
     eval)
       run eval 60 "$python" -m wildgs eval "$output/run" --protocol both ${lpips:+--lpips "$lpips"}
+      ;;
+    eager)
+      run eager 45 "$python" benchmarks/train_step.py --json --eager --n 1000000
       ;;
     *)
       echo "gpu.sh: unknown stage $stage" >&2

@@ -116,7 +116,7 @@ def gather(output: Path) -> dict[str, Any]:
         "stages": read_lines(parts / "stages.jsonl"),
         "tests": tests(parts / "parity.xml"),
         "train_step": read_json(parts / "steps.out"),
-        "train_step_without_graphs": read_json(parts / "steps_eager.out"),
+        "train_step_without_graphs": read_json(parts / "eager.out"),
         "render": render and [{**row, "frames_per_second": 1e3 / row["forward_ms"]} for row in render],
         "training": training(output / "run"),
     }

@@ -19,7 +19,6 @@ from pathlib import Path
 import torch
 
 from train_step import make_scene
-from wildgs.data import DataConfig, load_scene
 from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.distributed import join
@@ -29,6 +28,7 @@ from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
+from wildgs.scene import DataConfig, load_scene
 
 METHODS: tuple[MethodName, ...] = ("3dgs", "wildgs")
 DENSIFY_EVERY = 20  # optimiser steps

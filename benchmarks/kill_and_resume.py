@@ -23,7 +23,7 @@ from typing import Any
 
 import tyro
 
-from wildgs.data.synthetic import SyntheticConfig, make_landmark
+from demo_generator import SyntheticConfig, make_landmark
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.model.registry import MethodName
 

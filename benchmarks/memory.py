@@ -77,7 +77,6 @@ def _measure(command: Command, count: int, side: int) -> int:
 def _train_in_memory(command: Command, count: int, side: int) -> int:
     import torch
 
-    from wildgs.data import Alignment, Scene, View
     from wildgs.engine.checkpoint import save_checkpoint
     from wildgs.engine.schedule import ScheduleConfig
     from wildgs.engine.trainer import TrainConfig, Trainer
@@ -85,6 +84,7 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
     from wildgs.model.parsing import ParsingConfig
     from wildgs.model.registry import create_method
     from wildgs.model.wildgs import WildGSConfig
+    from wildgs.scene import Alignment, Scene, View
 
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=generator) - torch.tensor([0.5, 0.5, -1.0])
@@ -116,12 +116,12 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
 
 
 def _train_on_photos(command: Command) -> None:
-    from wildgs.data import DataConfig, load_scene
-    from wildgs.data.image_cache import parse_bytes
-    from wildgs.data.images import read_photo
     from wildgs.engine.trainer import TrainConfig, Trainer
     from wildgs.model.registry import create_method
     from wildgs.model.wildgs import WildGSConfig
+    from wildgs.scene import DataConfig, load_scene
+    from wildgs.scene.image_cache import parse_bytes
+    from wildgs.scene.images import read_photo
 
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)

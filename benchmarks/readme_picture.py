@@ -14,11 +14,11 @@ import tyro
 from PIL import Image
 
 from wildgs.cli.showcase import different_lights
-from wildgs.data import View, find_view
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import load_run
+from wildgs.scene import View, find_view
 
 GAP = 6
 

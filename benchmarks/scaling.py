@@ -26,13 +26,13 @@ from statistics import median
 import torch
 
 from train_step import make_scene, make_trainer, peak_memory
-from wildgs.data import DataConfig, Scene, load_scene
 from wildgs.engine.distributed import join
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
+from wildgs.scene import DataConfig, Scene, load_scene
 
 
 @dataclass

@@ -32,14 +32,14 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from wildgs.data import DataConfig, Scene, load_scene
-from wildgs.data.synthetic import SyntheticConfig, make_landmark
+from demo_generator import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
+from wildgs.scene import DataConfig, Scene, load_scene
 
 METHODS: tuple[MethodName, ...] = ("3dgs", "wildgs")
 SIZES = ((500, 375), (1000, 750))

@@ -29,10 +29,10 @@ from PIL import Image
 
 import wildgs
 from wildgs.cli.showcase import different_lights
-from wildgs.data import View
 from wildgs.export.sheet import contact_sheet
 from wildgs.light.look import Look
 from wildgs.light.photos import encode_view
+from wildgs.scene import View
 
 SOURCES = 4
 LEAST_DISTANCE = 5.0  # Lab; below, the source's light is the view's own and a ratio says nothing

@@ -26,9 +26,9 @@ import tyro
 from torch import Tensor
 
 from wildgs import LoadedScene, Look, load
-from wildgs.data import View
 from wildgs.evaluation.metrics import psnr, to_8bit
 from wildgs.rasterize import blend
+from wildgs.scene import View
 from wildgs.viewer.cameras import camera_of, fov_that_holds, pose_of
 from wildgs.viewer.display import SplatDisplay
 from wildgs.viewer.server import ServerConfig, address, open_server

@@ -30,6 +30,8 @@ def _modules_to_check() -> list[str]:
 
 install_import_hook(_modules_to_check(), "beartype.beartype")
 
+pytest_plugins = ["tests.scene_files"]
+
 
 def _missing(marker: str) -> str | None:
     if marker == "shared" and not (SHARED / "data").is_dir():
@@ -94,7 +96,7 @@ TRAIN = (
 @pytest.fixture(scope="session")
 def landmark(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo's landmark, tiny."""
-    from wildgs.data.synthetic import SyntheticConfig, make_landmark
+    from demo_generator import SyntheticConfig, make_landmark
 
     folder = tmp_path_factory.mktemp("landmark") / "scene"
     make_landmark(folder, SyntheticConfig(photos=9, test_every=4, long_side=48, points=1500, least_views=2))

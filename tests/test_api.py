@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import wildgs
-from wildgs.data import loading
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.scene import loading as loading
 
 DOCS = Path(__file__).parents[1] / "docs" / "python.md"
 

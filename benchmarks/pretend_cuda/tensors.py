@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import traceback
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from itertools import count
 from typing import Any
 from unittest.mock import patch
 
@@ -221,68 +220,6 @@ def _has_boolean_index(name: str, args: Any) -> bool:
     return any(isinstance(index, Tensor) and index.dtype in (torch.bool, torch.uint8) for index in args[1])
 
 
-class _Graph(torch.autograd.Function):
-    """A replay: one launch each way, besides those that carry tensors in and out of the graph's own memory."""
-
-    @staticmethod
-    def forward(ctx: Any, graph: _Recorded, x: Tensor, *parameters: Tensor) -> Any:
-        with RECORD.silence(), torch.enable_grad():
-            graph.x.copy_(x)
-            outputs = graph.function(graph.x)
-            if not graph.outputs:
-                graph.outputs = [output.detach().clone() for output in outputs]
-            for other in graph.sharing:
-                for kept in other.outputs:
-                    kept.fill_(torch.nan)  # as good as anything: its memory is another's now
-            for kept, output in zip(graph.outputs, outputs, strict=True):
-                kept.copy_(output.detach())
-        ctx.outputs, ctx.parameters = outputs, parameters
-        RECORD.launch("copy into a graph")
-        RECORD.launch("graph")
-        return tuple(output.detach() for output in graph.outputs)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:
-        pairs = [(o, g) for o, g in zip(ctx.outputs, gradients, strict=True) if o.requires_grad]
-        with RECORD.silence():
-            found = torch.autograd.grad(
-                [output for output, _ in pairs],
-                ctx.parameters,
-                [gradient for _, gradient in pairs],
-                allow_unused=True,
-            )
-        for _ in pairs:
-            RECORD.launch("copy into a graph")
-        RECORD.launch("graph, backward")
-        return (None, None, *found)
-
-
-@dataclass
-class _Recorded:
-    function: Callable[[Tensor], tuple[Tensor, ...]]
-    x: Tensor
-    sharing: list[_Recorded]
-    outputs: list[Tensor] = field(default_factory=list)
-
-
-_POOLS: dict[Any, list[_Recorded]] = defaultdict(list)
-_pool_numbers = count(1)
-
-
-def _make_graphed_callables(
-    part: Any, sample: tuple[Tensor], *, allow_unused_input: bool = False, pool: Any = None
-) -> Any:
-    """Like `torch.cuda.make_graphed_callables` for one input: what comes out is overwritten by the next replay.
-
-    Of another graph with the same memory, too.
-    """
-    RECORD.graphs += 1
-    sharing = _POOLS[pool]
-    graph, parameters = _Recorded(part.forward, sample[0], sharing), tuple(part.parameters())
-    sharing.append(graph)
-    return lambda x: _Graph.apply(graph, x, *parameters)
-
-
 def _pin(tensor: Tensor) -> Tensor:
     pinned = tensor.clone()
     pinned.pinned = True  # pyright: ignore[reportAttributeAccessIssue]
@@ -301,6 +238,7 @@ def _tensor(data: Any, *args: Any, device: Any = None, **kwargs: Any) -> Tensor:
 @contextmanager
 def pretend() -> Iterator[Record]:
     """See `pretend_cuda.device`."""
+    from pretend_cuda import graphs
     from pretend_cuda.gsplat import StandIn
     from wildgs.rasterize import cuda as backend
 
@@ -323,8 +261,8 @@ def pretend() -> Iterator[Record]:
             (torch.cuda, "max_memory_allocated", lambda *_: 0),
             (torch.cuda, "empty_cache", lambda: None),
             (torch.cuda, "get_device_name", lambda *_: "no GPU, pretended"),
-            (torch.cuda, "graph_pool_handle", lambda: (0, next(_pool_numbers))),
-            (torch.cuda, "make_graphed_callables", _make_graphed_callables),
+            (torch.cuda, "graph_pool_handle", graphs.graph_pool_handle),
+            (torch.cuda, "make_graphed_callables", graphs.make_graphed_callables),
             (backend, "_gsplat", lambda: gsplat),
         ):
             stack.enter_context(patch.object(target, name, value))

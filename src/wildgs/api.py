@@ -15,8 +15,6 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from wildgs.data import Scene, View
-from wildgs.data.paths import make_path
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
 from wildgs.light.look import Look
@@ -25,6 +23,8 @@ from wildgs.light.timeline import Timeline
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import blend, sh_to_colors
 from wildgs.runs import Run, load_run
+from wildgs.scene import Scene, View
+from wildgs.scene.trajectories import make_path
 
 LANDMARK_FILE = "landmarks.safetensors"
 """In the run folder: what new photos are localised against, made when the first one comes."""

@@ -15,12 +15,12 @@ from typing import Any, Literal
 import yaml
 import yaml.composer
 
-from wildgs.data import DataConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
+from wildgs.scene import DataConfig
 
 MAX_CONFIG_BYTES = 1_000_000
 

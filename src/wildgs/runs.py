@@ -13,9 +13,6 @@ import filelock
 import torch
 
 from wildgs.config import RunConfig, read_config, to_plain, write_config
-from wildgs.data import Alignment, Scene, load_scene
-from wildgs.data.depth_points import depth_points
-from wildgs.data.ground import ground_points
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
@@ -23,6 +20,9 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
 from wildgs.model.wildgs import ColoredPoints
+from wildgs.priors.depth_points import depth_points
+from wildgs.priors.ground import ground_points
+from wildgs.scene import Alignment, Scene, load_scene
 
 CONFIG_FILE = "config.yaml"
 CHECKPOINT_FOLDER = "checkpoints"

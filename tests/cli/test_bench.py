@@ -11,8 +11,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from wildgs.data import Scene
 from wildgs.engine.trainer import Trainer
+from wildgs.scene import Scene
 
 TINY = (
     "--steps",

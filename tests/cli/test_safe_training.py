@@ -248,8 +248,8 @@ def test_an_interrupted_demo_goes_on(landmark: Path, tmp_path: Path) -> None:
     from dataclasses import replace
 
     from wildgs.config import RunConfig, read_config
-    from wildgs.data import load_scene
     from wildgs.engine.trainer import TrainConfig
+    from wildgs.scene import load_scene
 
     config = RunConfig(landmark, "3dgs", train=TrainConfig(steps=4))
     scene = load_scene(landmark)

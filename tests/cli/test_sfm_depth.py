@@ -4,7 +4,7 @@ import pytest
 
 from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
-from wildgs.data.sfm_report import SfmReport
+from wildgs.sfm.report import SfmReport
 
 
 @pytest.mark.parametrize(

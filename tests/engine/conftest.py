@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.data import Alignment, Scene, View
 from wildgs.geometry.camera import Camera
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
+from wildgs.scene import Alignment, Scene, View
 
 SIDE = 32
 

@@ -10,18 +10,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wildgs.data import Scene
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method, restore_method
 from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.scene import Scene
 
 pytestmark = [pytest.mark.cuda, pytest.mark.filterwarnings("ignore:no ImageNet weights")]
 
 CONFIG = TrainConfig(
     steps=60, precision="float32", density=DensityConfig(grow_gradient=1e-5, max_gaussians=900)
 )
-STEPS = 30
+STEPS = 26
 
 
 def trainer_on(
@@ -50,7 +50,7 @@ def test_training_goes_as_on_the_cpu(wall_scene: Scene, tiny_model: WildGSConfig
     # Convolutions round to TF32 on GPUs, and differences grow from step to step; what is learnt stays.
     assert found[:2] == pytest.approx(wanted[:2], rel=2e-3)
     assert found[:10] == pytest.approx(wanted[:10], rel=0.05)
-    assert sum(found[-15:]) == pytest.approx(sum(wanted[-15:]), rel=0.25)
+    assert sum(found[-12:]) == pytest.approx(sum(wanted[-12:]), rel=0.25)
     assert len(cuda.method.gaussians) == len(cpu.method.gaussians) > len(wall_scene.points)
 
 
@@ -70,7 +70,7 @@ def test_graphs_change_nothing_but_speed(wall_scene: Scene, tiny_model: WildGSCo
 
 def test_a_state_of_cuda_goes_on_there_and_opens_on_the_cpu(wall_scene: Scene, tiny_model: WildGSConfig):
     trainer = trainer_on("cuda", wall_scene, tiny_model)
-    losses_of(trainer, 16)
+    losses_of(trainer, 14)
     kept = {name: value.detach().cpu().clone() for name, value in trainer.state().items()}
     pictures, further = {}, {}
     for device in ("cpu", "cuda"):
@@ -85,7 +85,7 @@ def test_a_state_of_cuda_goes_on_there_and_opens_on_the_cpu(wall_scene: Scene, t
         resumed = Trainer(method, wall_scene, CONFIG)
         resumed.restore(state)
         resumed.begin()
-        further[device] = losses_of(resumed, 10)
+        further[device] = losses_of(resumed, 7)
     torch.testing.assert_close(pictures["cuda"], pictures["cpu"], atol=5e-3, rtol=0)
     assert further["cuda"][:2] == pytest.approx(further["cpu"][:2], rel=0.01)
     assert sum(further["cuda"]) == pytest.approx(sum(further["cpu"]), rel=0.2)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from wildgs.data import Scene
 from wildgs.engine import memory
 from wildgs.engine.memory import FIXED_BYTES, plan_budget
 from wildgs.errors import UserError
+from wildgs.scene import Scene
 
 CPU = torch.device("cpu")
 

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from wildgs.data import Scene
 from wildgs.engine.autosave import Autosave, AutosaveConfig
 from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.safety import PATIENCE, TrainingDivergedError
@@ -17,6 +16,7 @@ from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import create_method, restore_method
 from wildgs.model.wildgs import WildGSConfig
+from wildgs.scene import Scene
 
 
 def trainer_for(scene: Scene, steps: int) -> Trainer:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.data import Scene
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.schedule import ScheduleConfig
@@ -17,6 +16,7 @@ from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import MethodName, create_method, restore_method
 from wildgs.model.wildgs import WildGSConfig
+from wildgs.scene import Scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
 

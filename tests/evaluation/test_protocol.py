@@ -8,7 +8,6 @@ import pytest
 import torch
 from PIL import Image
 
-from wildgs.data.scene import Alignment, Scene, View
 from wildgs.errors import UserError
 from wildgs.evaluation.lpips_weights import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
@@ -17,6 +16,7 @@ from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians, geometry_from_points
 from wildgs.model.method import Method, Stage, TrainingOutput
 from wildgs.rasterize import Rendering
+from wildgs.scene.scene import Alignment, Scene, View
 
 H, W = 40, 61
 

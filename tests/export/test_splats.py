@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from wildgs.data import Alignment
 from wildgs.export.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.rasterize import rasterize
+from wildgs.scene import Alignment
 
 
 def _picture(splats: Splats, camera: Camera) -> torch.Tensor:

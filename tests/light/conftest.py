@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.data import Alignment, Scene, View
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.vanilla import VanillaGS
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
+from wildgs.scene import Alignment, Scene, View
 
 SIDE = 32
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 from PIL import Image
 
-from wildgs.data.localize import LocalizationError, LocalizedPhoto
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.light import sources as module
 from wildgs.light.look import NEUTRAL
 from wildgs.light.photos import cover, encode_picture, encode_view
 from wildgs.light.saved import save_look
 from wildgs.light.sources import LightSources
+from wildgs.sfm.localization import LocalizationError, LocalizedPhoto
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def unknown_place(monkeypatch) -> None:
     def fail(file, *_):
         raise LocalizationError(f"{file}: could not be localised (3 inliers of 9 matches)")
 
-    monkeypatch.setattr(module, "load_landmarks", lambda *_: None)
+    monkeypatch.setattr(module, "load_feature_index", lambda *_: None)
     monkeypatch.setattr(module, "localize", fail)
 
 
@@ -101,7 +101,7 @@ def test_a_picture_that_cannot_be_localised_says_so_and_is_used(sources, picture
 
 
 def test_with_like_nothing_is_localised(sources, picture, monkeypatch) -> None:
-    monkeypatch.setattr(module, "load_landmarks", lambda *_: pytest.fail("localised"))
+    monkeypatch.setattr(module, "load_feature_index", lambda *_: pytest.fail("localised"))
     assert "0.jpg" in sources.find(picture, like="0.jpg").note
 
 
@@ -110,7 +110,7 @@ def test_a_new_photo_of_the_place_is_encoded_from_its_camera(
 ) -> None:
     view = wall.views[5]
     found = LocalizedPhoto(view.read_photo(), view.camera, 77, 99, 0.94, False)
-    monkeypatch.setattr(module, "load_landmarks", lambda *_: None)
+    monkeypatch.setattr(module, "load_feature_index", lambda *_: None)
     monkeypatch.setattr(module, "localize", lambda *_: found)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

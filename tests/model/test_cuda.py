@@ -16,7 +16,7 @@ from wildgs.model.triplane import project_cloud, sample_planes
 pytestmark = [pytest.mark.cuda, pytest.mark.filterwarnings("ignore:no ImageNet weights")]
 
 
-def same_on_both(function: Callable[..., Tensor], *inputs: Tensor, tolerance: float = 1e-5) -> None:
+def assert_same_on_both(function: Callable[..., Tensor], *inputs: Tensor, tolerance: float = 1e-5) -> None:
     """Compares values, and gradients of all inputs that are to have one."""
     results = {}
     for device in ("cpu", "cuda"):
@@ -33,14 +33,16 @@ def same_on_both(function: Callable[..., Tensor], *inputs: Tensor, tolerance: fl
 def test_sampling_of_planes():
     planes = torch.randn(3, 8, 16, 16, generator=torch.Generator().manual_seed(0), requires_grad=True)
     points = 2 * torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) - 1
-    same_on_both(sample_planes, planes, points, tolerance=1e-4)
+    assert_same_on_both(sample_planes, planes, points, tolerance=1e-4)
 
 
 def test_pictures_of_a_cloud():
     points = 1.2 * (2 * torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) - 1)
     colors = torch.rand(3000, 3, generator=torch.Generator().manual_seed(1))
     keep = torch.rand(3000, generator=torch.Generator().manual_seed(2)) > 0.3
-    same_on_both(lambda *cloud: project_cloud(*cloud[:2], 16, cloud[2]), points, colors, keep, tolerance=0)
+    assert_same_on_both(
+        lambda *cloud: project_cloud(*cloud[:2], 16, cloud[2]), points, colors, keep, tolerance=0
+    )
 
 
 def test_no_point_and_no_kept_point():
@@ -52,7 +54,7 @@ def test_no_point_and_no_kept_point():
 def test_rows():
     values = torch.randn(40, 5, requires_grad=True)
     visible = torch.arange(40) % 3 == 0
-    same_on_both(lambda values, visible: take_rows(values, visible.nonzero()[:, 0]), values, visible)
+    assert_same_on_both(lambda values, visible: take_rows(values, visible.nonzero()[:, 0]), values, visible)
     assert torch.equal(rows_to_shade(visible.cuda()).cpu(), visible.nonzero()[:, 0])
 
 
@@ -66,7 +68,7 @@ def test_frozen_normalisation():
     frozen.weight.data.uniform_(0.5, 2)
     frozen.bias.data.uniform_(-1, 1)
     x = torch.randn(2, 6, 5, 7, requires_grad=True)
-    same_on_both(lambda x: frozen.to(x.device)(x), x, tolerance=1e-4)
+    assert_same_on_both(lambda x: frozen.to(x.device)(x), x, tolerance=1e-4)
 
 
 def test_parsing():
@@ -74,4 +76,4 @@ def test_parsing():
     parsing = Parsing(ParsingConfig(encoder="nobody/none", max_side=64))
     photo = torch.rand(48, 80, 3)
     for output in (0, 1):
-        same_on_both(lambda photo: parsing.to(photo.device)(photo)[output], photo, tolerance=5e-3)  # noqa: B023
+        assert_same_on_both(lambda photo: parsing.to(photo.device)(photo)[output], photo, tolerance=5e-3)  # noqa: B023

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.data import Alignment, Scene, View, scene_extent
-from wildgs.data.alignment import align_world
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.geometry.camera import Camera
@@ -17,6 +15,8 @@ from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
+from wildgs.scene import Alignment, Scene, View, scene_extent
+from wildgs.scene.alignment import align_world
 
 pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
 

@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from wildgs.config import RunConfig, from_plain
-from wildgs.data.colmap import _checked_name
 from wildgs.errors import UserError
+from wildgs.scene.colmap import _checked_name
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"
 SOURCE = Path(__file__).parents[2] / "src"

@@ -20,7 +20,6 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from wildgs.config import RunConfig, write_config
-from wildgs.data import DataConfig, load_scene
 from wildgs.engine import checkpoint as checkpoint_module
 from wildgs.engine.checkpoint import load_checkpoint
 from wildgs.errors import UserError, WildGSWarning
@@ -32,6 +31,7 @@ from wildgs.model.encoder import load_encoder
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
 from wildgs.runs import load_run, save_run, start_training
+from wildgs.scene import DataConfig, load_scene
 
 
 def _sibling(name: str):

@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 import torch
 
-from wildgs.data import Alignment, Scene, View
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import WildGSWarning
 from wildgs.geometry.camera import Camera
@@ -27,6 +26,7 @@ from wildgs.model.registry import create_method
 from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
+from wildgs.scene import Alignment, Scene, View
 from wildgs.viewer.subject import Subject
 
 SIDE = 32

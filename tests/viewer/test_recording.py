@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs.data import Scene
 from wildgs.errors import UserError
 from wildgs.geometry.camera_file import read_camera_path
+from wildgs.scene import Scene
 from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.lighting import Light, LightDesk

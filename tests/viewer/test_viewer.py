@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs.data import Scene
 from wildgs.engine.trainer import Trainer
+from wildgs.scene import Scene
 from wildgs.viewer.cameras import Pose
 from wildgs.viewer.server import ServerConfig, open_server
 from wildgs.viewer.splats import colors_from

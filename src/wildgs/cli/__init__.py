@@ -8,7 +8,7 @@ import os
 import sys
 import warnings
 
-from wildgs import launch
+from wildgs import processes
 from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.version import __version__
 
@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> None:
     if verb not in VERBS:
         _fail(f"there is no verb {verb!r}; `wildgs --help` lists them")
     try:
-        if launch.world_size() > 1 and verb not in DISTRIBUTED:
+        if processes.world_size() > 1 and verb not in DISTRIBUTED:
             raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
         _run(verb, rest)
     except ReportedError:
@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         sys.exit(BROKEN_PIPE)
     except KeyboardInterrupt as interrupt:
-        if not launch.rank():
+        if not processes.rank():
             print(str(interrupt) or "interrupted", file=sys.stderr)
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
 
@@ -104,7 +104,7 @@ def _fail(message: str) -> None:
 
 def _speaker() -> str:
     """Names the process before its message, where it is one of several and not the first."""
-    return f"rank {launch.rank()}: " if launch.rank() else ""
+    return f"rank {processes.rank()}: " if processes.rank() else ""
 
 
 def _usage() -> str:

@@ -12,7 +12,7 @@ import torch
 import tyro
 from rich.table import Table
 
-from wildgs import launch
+from wildgs import processes
 from wildgs.cli.bench_plan import (
     LABELS,
     METHODS,
@@ -27,7 +27,6 @@ from wildgs.cli.eval import evaluate_run
 from wildgs.cli.progress import console
 from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.config import RunConfig
-from wildgs.data import DataConfig, Scene
 from wildgs.engine.checkpoint import list_checkpoints
 from wildgs.engine.collectives import raise_once
 from wildgs.engine.distributed import settle
@@ -44,6 +43,7 @@ from wildgs.evaluation.published import published_figures
 from wildgs.files import written_aside
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import CHECKPOINT_FOLDER, load_run
+from wildgs.scene import DataConfig, Scene
 from wildgs.version import __version__
 
 PROTOCOLS: tuple[Protocol, ...] = ("full", "half")
@@ -91,7 +91,7 @@ def run(command: Command) -> None:
         UserError: The command makes no sense, or some runs failed.
     """
     queue = JobQueue("bench")
-    if launch.world_size() > 1:
+    if processes.world_size() > 1:
         settle()
     jobs = _plan_together(command, queue)
     console.quiet = not queue.first
@@ -123,7 +123,7 @@ def _plan_together(command: Command, queue: JobQueue) -> list[Job]:
         jobs = _plan(command)
     except UserError as error:
         own = error
-    raise_once(queue.gather("mistakes", None if own is None else str(own)), launch.rank(), own)
+    raise_once(queue.gather("mistakes", None if own is None else str(own)), processes.rank(), own)
     return jobs
 
 
@@ -138,7 +138,7 @@ def _tell(failures: Mapping[str, str], count: int, queue: JobQueue) -> None:
 
 
 def _speaker() -> str:
-    return f"rank {launch.rank()}: " if launch.world_size() > 1 else ""
+    return f"rank {processes.rank()}: " if processes.world_size() > 1 else ""
 
 
 def _plan(command: Command) -> list[Job]:

@@ -13,13 +13,13 @@ from typing import Any, Literal, get_args
 import yaml
 
 from wildgs.config import RunConfig, differing_entries, read_config, with_entries
-from wildgs.data.colmap import find_model
-from wildgs.data.phototourism import find_split_file
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.presets import with_preset
 from wildgs.runs import CONFIG_FILE
+from wildgs.scene.colmap import find_model
+from wildgs.scene.split import find_split_file
 
 BenchMethod = Literal[
     "3dgs",

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from demo_generator import SyntheticConfig, make_landmark
 from wildgs.cli.eval import evaluate_run, print_scores
 from wildgs.cli.progress import console, counting
 from wildgs.cli.showcase import Scores, write_showcase
 from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.cli.webpage import write_scene_page
 from wildgs.config import RunConfig
-from wildgs.data.synthetic import SyntheticConfig, make_landmark
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError

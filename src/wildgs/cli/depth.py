@@ -9,8 +9,8 @@ from typing import Literal
 import tyro
 
 from wildgs.cli.progress import console, counting
-from wildgs.data.depth_prior import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 from wildgs.errors import UserError
+from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 
 
 @dataclass(frozen=True)

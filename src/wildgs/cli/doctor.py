@@ -191,7 +191,7 @@ def _encoder_weights() -> Check:
 
 
 def _depth_weights() -> Check:
-    from wildgs.data.depth_prior import DEPTH_ANYTHING
+    from wildgs.priors.depth import DEPTH_ANYTHING
 
     return _hub_weights("depth weights", DEPTH_ANYTHING, "scenes without depth/ train without the depth loss")
 

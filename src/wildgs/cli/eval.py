@@ -10,9 +10,9 @@ import tyro
 from rich.table import Table
 
 from wildgs.cli.progress import console, counting
-from wildgs.data import Scene
 from wildgs.evaluation.protocol import Protocol, evaluate
 from wildgs.runs import Run, load_run
+from wildgs.scene import Scene
 
 
 @dataclass(frozen=True)

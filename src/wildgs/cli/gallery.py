@@ -15,13 +15,13 @@ from wildgs.api import LoadedScene, load
 from wildgs.cli.lights import LightOptions, find_looks
 from wildgs.cli.progress import console, counting
 from wildgs.cli.showcase import different_lights
-from wildgs.data import Scene, View, find_view, match_view
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
 from wildgs.export.sheet import contact_sheet
 from wildgs.files import written_aside
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.light.sources import read_picture
+from wildgs.scene import Scene, View, find_view, match_view
 
 VIEWS, LIGHTS = 4, 5
 TILE = 320

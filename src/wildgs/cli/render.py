@@ -13,13 +13,13 @@ import tyro
 from wildgs.api import LoadedScene, load
 from wildgs.cli.lights import LightOptions, find_look, find_looks
 from wildgs.cli.progress import Counter, console, counting
-from wildgs.data import find_view
-from wildgs.data.paths import AROUND, THROUGH, read_path
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
 from wildgs.export.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.light.look import Look
+from wildgs.scene import find_view
+from wildgs.scene.trajectories import AROUND, THROUGH, read_path
 
 DEFAULT_PATH = "orbit"
 DEFAULT_FPS = 30.0

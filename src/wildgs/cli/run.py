@@ -15,13 +15,13 @@ from wildgs.cli.showcase import Scores, write_showcase
 from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.cli.webpage import write_scene_page
 from wildgs.config import RunConfig
-from wildgs.data import DataConfig, Scene
-from wildgs.data.depth_prior import fill_depth_folder, load_depth_anything
-from wildgs.data.images import UnreadableImageError, open_image
-from wildgs.data.photos import SfmConfig
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
+from wildgs.priors.depth import fill_depth_folder, load_depth_anything
 from wildgs.runs import default_device, load_run
+from wildgs.scene import DataConfig, Scene
+from wildgs.scene.images import UnreadableImageError, open_image
+from wildgs.sfm.reconstruction import SfmConfig
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from wildgs.cli.progress import console, stages
-from wildgs.data.photos import SfmConfig, SfmReport, reconstruct
+from wildgs.sfm.reconstruction import SfmConfig, SfmReport, reconstruct
 
 
 @dataclass(frozen=True)

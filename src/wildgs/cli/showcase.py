@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wildgs.data import Scene, View
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.protocol import Protocol
 from wildgs.export.report import MethodScores, Report, ReportExample, write_report
@@ -18,6 +17,7 @@ from wildgs.geometry.tour import spread_out
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import Run
+from wildgs.scene import Scene, View
 
 EXAMPLES = 4
 LIGHTS = 3

@@ -13,7 +13,6 @@ import tyro
 from wildgs.cli.progress import console
 from wildgs.cli.training import Window, plan_memory, read_scene, train_within_memory, with_budget
 from wildgs.config import RunConfig, read_config
-from wildgs.data import DataConfig
 from wildgs.engine.autosave import AutosaveConfig
 from wildgs.engine.distributed import join
 from wildgs.engine.team import Team
@@ -26,6 +25,7 @@ from wildgs.runs import (
     lock_run,
     refuse_trained,
 )
+from wildgs.scene import DataConfig
 from wildgs.viewer.server import ServerConfig, import_viser
 
 

@@ -15,7 +15,6 @@ from wildgs.cli.interrupts import InterruptedTrainingError, StopOnSignal
 from wildgs.cli.logs import logger, run_log
 from wildgs.cli.progress import TrainingProgress, console, counting
 from wildgs.config import RunConfig, read_config
-from wildgs.data import Scene, load_scene
 from wildgs.engine.autosave import Autosave, AutosaveConfig
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
@@ -23,6 +22,7 @@ from wildgs.engine.team import Team
 from wildgs.engine.trainer import Observer, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.runs import CONFIG_FILE, default_device, lock_run, prepare_training, save_run
+from wildgs.scene import Scene, load_scene
 from wildgs.viewer.server import ServerConfig
 
 if TYPE_CHECKING:

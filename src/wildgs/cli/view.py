@@ -10,9 +10,9 @@ import tyro
 
 from wildgs.api import load
 from wildgs.cli.progress import console
-from wildgs.data import Scene
 from wildgs.engine.trainer import StepReport, Trainer
 from wildgs.errors import UserError
+from wildgs.scene import Scene
 from wildgs.viewer.jobs import start_worker
 from wildgs.viewer.server import ServerConfig, address, open_server
 from wildgs.viewer.subject import Subject, TrainingSubject

@@ -12,7 +12,6 @@ import torch
 from wildgs.api import LoadedScene
 from wildgs.cli.lights import find_look
 from wildgs.cli.showcase import different_lights
-from wildgs.data import View, match_view
 from wildgs.export.cleanup import CleanupConfig, kept_rows
 from wildgs.export.page import Page, PageLight, PageView, write_page
 from wildgs.export.splats import Splats
@@ -20,6 +19,7 @@ from wildgs.export.start_view import choose_start
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.model.gaussians import NEAR
 from wildgs.runs import Run
+from wildgs.scene import View, match_view
 
 PAGE_LIGHTS = 4
 

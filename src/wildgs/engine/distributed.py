@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch import distributed as dist
 
-from wildgs import launch
+from wildgs import processes
 from wildgs.engine.collectives import fingerprints, raise_once, sum_over_ranks
 from wildgs.engine.density import ScreenStatistics
 from wildgs.engine.team import DivergedRanksError, LostRankError, Team
@@ -193,7 +193,7 @@ def join() -> Iterator[Team]:
     Raises:
         UserError: There are more processes than GPUs, or no connection.
     """
-    if launch.world_size() == 1:
+    if processes.world_size() == 1:
         yield Team()
         return
     # A library's handler would print a page of stack where torchrun ends those that are left.
@@ -233,12 +233,12 @@ def settle() -> torch.device:
     if not torch.cuda.is_available():
         return torch.device("cpu")
     count = torch.cuda.device_count()
-    if launch.local_rank() >= count:
+    if processes.local_rank() >= count:
         raise UserError(
-            f"this machine has {count} GPUs for {launch.local_world_size()} processes; "
+            f"this machine has {count} GPUs for {processes.local_world_size()} processes; "
             f"use --nproc-per-node {count}"
         )
-    device = torch.device("cuda", launch.local_rank())
+    device = torch.device("cuda", processes.local_rank())
     torch.cuda.set_device(device)
     return device
 
@@ -248,5 +248,5 @@ def _share_cores() -> None:
     if os.environ.get("OMP_NUM_THREADS", "1") != "1":
         return  # the user's choice
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    share = max(1, cores // launch.local_world_size())
+    share = max(1, cores // processes.local_world_size())
     torch.set_num_threads(thread_count() if "WILDGS_NUM_THREADS" in os.environ else share)

@@ -15,7 +15,7 @@ from typing import Any
 from torch.distributed import PrefixStore, Store  # pyright: ignore[reportPrivateImportUsage]
 from torch.distributed.rendezvous import rendezvous
 
-from wildgs import launch
+from wildgs import processes
 from wildgs.errors import UserError
 
 POLL_SECONDS = 0.5
@@ -35,7 +35,7 @@ class JobQueue:
             UserError: The processes find no connection to each other.
         """
         self._store: Store | None = None
-        if launch.world_size() == 1:
+        if processes.world_size() == 1:
             return
         try:
             store, _, _ = next(iter(rendezvous("env://", timeout=CONNECT)))
@@ -47,7 +47,7 @@ class JobQueue:
     @property
     def first(self) -> bool:
         """Whether this process speaks for all."""
-        return launch.rank() == 0
+        return processes.rank() == 0
 
     def take(self, count: int) -> Iterator[int]:
         """Numbers below `count` that no other process has taken, until none is left."""
@@ -68,14 +68,14 @@ class JobQueue:
         """
         if self._store is None:
             return [own]
-        self._store.set(f"{what}/{launch.rank()}", json.dumps(own))
+        self._store.set(f"{what}/{processes.rank()}", json.dumps(own))
         self._wait_for_all(f"{what}/brought")
-        gathered = [json.loads(self._store.get(f"{what}/{rank}")) for rank in range(launch.world_size())]
+        gathered = [json.loads(self._store.get(f"{what}/{rank}")) for rank in range(processes.world_size())]
         self._wait_for_all(f"{what}/read")  # a store may end with the process that keeps it
         return gathered
 
     def _wait_for_all(self, counter: str) -> None:
         assert self._store is not None
         self._store.add(counter, 1)
-        while self._store.add(counter, 0) < launch.world_size():
+        while self._store.add(counter, 0) < processes.world_size():
             time.sleep(POLL_SECONDS)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import torch
 
-from wildgs.data import Scene
-from wildgs.data.image_cache import available_memory
 from wildgs.errors import UserError
 from wildgs.model.registry import MethodName
+from wildgs.scene import Scene
+from wildgs.scene.image_cache import available_memory
 
 BYTES_PER_GAUSSIAN: dict[MethodName, int] = {"wildgs": 6000, "3dgs": 2500}
 """Parameters, gradients, Adam's moments, the copies of densification, and one view's intermediate values."""

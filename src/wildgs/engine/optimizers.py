@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool
@@ -183,46 +183,40 @@ def edit_rows(
         keep: Which present Gaussians stay, in their order.
         added: New Gaussians' rows, one tensor for every row name; they start with empty Adam moments.
     """
-    for group in optimizer.param_groups:
-        name = group["name"]
-        old = gaussians.rows[name]
-        new = nn.Parameter(torch.cat([old[keep], added[name].to(old)]))
-        state = optimizer.state.pop(old, {})
-        for key, value in state.items():
-            if isinstance(value, Tensor) and value.shape == old.shape:
-                state[key] = torch.cat([value[keep], torch.zeros_like(added[name], dtype=value.dtype)])
-        _replace_rows(gaussians, optimizer, group, new, state)
+
+    def edited(name: str, values: Tensor, moments: bool) -> Tensor:
+        new = added[name].to(values)
+        return torch.cat([values[keep], torch.zeros_like(new) if moments else new])
+
+    _change_rows(gaussians, optimizer, edited)
 
 
 @torch.no_grad()
 def sort_rows(gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
     """Puts Gaussians that are near in space near in memory, in parameters and optimiser state alike.
 
-    What gathers from the triplane and scatters back to it, a third of the networks' time, then finds most of it in
-    the cache.
+    What samples the triplane and scatters back to it then finds its neighbours' cells in the cache.
     """
     order = morton_order(gaussians.means)
-    for group in optimizer.param_groups:
-        old = gaussians.rows[group["name"]]
-        state = optimizer.state.pop(old, {})
-        moved = {
-            key: value[order] if isinstance(value, Tensor) and value.shape == old.shape else value
-            for key, value in state.items()
-        }
-        _replace_rows(gaussians, optimizer, group, nn.Parameter(old[order]), moved)
+    _change_rows(gaussians, optimizer, lambda _, values, moments: values[order])
 
 
-def _replace_rows(
-    gaussians: Gaussians,
-    optimizer: torch.optim.Optimizer,
-    group: dict[str, Any],
-    new: nn.Parameter,
-    state: dict[str, Any],
+def _change_rows(
+    gaussians: Gaussians, optimizer: torch.optim.Optimizer, change: Callable[[str, Tensor, bool], Tensor]
 ) -> None:
-    if state:
-        optimizer.state[new] = state
-    group["params"] = [new]
-    gaussians.rows[group["name"]] = new
+    """Replaces every row's parameter and its moments by what `change(name, values, moments)` makes of them."""
+    for group in optimizer.param_groups:
+        name = group["name"]
+        old = gaussians.rows[name]
+        new = nn.Parameter(change(name, old, False))
+        state = optimizer.state.pop(old, {})
+        for key, value in state.items():
+            if isinstance(value, Tensor) and value.shape == old.shape:
+                state[key] = change(name, value, True)
+        if state:
+            optimizer.state[new] = state
+        group["params"] = [new]
+        gaussians.rows[name] = new
 
 
 @torch.no_grad()

@@ -10,11 +10,11 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from wildgs.data import View
 from wildgs.engine.density import ScreenStatistics
 from wildgs.errors import UserError
 from wildgs.losses.objective import Losses
 from wildgs.model.method import Method
+from wildgs.scene import View
 from wildgs.version import __version__
 
 Result = TypeVar("Result")

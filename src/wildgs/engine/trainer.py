@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from wildgs.data import Scene, View, scene_extent
 from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
 from wildgs.engine.feed import PhotoFeed
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers, sort_rows
@@ -29,6 +28,7 @@ from wildgs.model.precision import (
     set_precision,
     switch_replays,
 )
+from wildgs.scene import Scene, View, scene_extent
 
 PREPARATION_PHOTOS = 16
 

@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from wildgs.data.scene import Scene, View
 from wildgs.errors import UserError
 from wildgs.evaluation.lpips import LPIPS, MIN_SIDE
 from wildgs.evaluation.lpips_weights import load_lpips
@@ -23,6 +22,7 @@ from wildgs.evaluation.masks import MaskScore
 from wildgs.evaluation.metrics import psnr, structural_similarity, to_8bit
 from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
 from wildgs.model.method import Method
+from wildgs.scene.scene import Scene, View
 
 Protocol = Literal["full", "half"]
 METRICS = ("psnr", "ssim", "lpips")

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wildgs.data.scene import Alignment
 from wildgs.geometry.rotation import rotations_to_quats
 from wildgs.geometry.sh_rotation import rotate_sh, sh_degree
+from wildgs.scene.scene import Alignment
 
 
 @dataclass(frozen=True)

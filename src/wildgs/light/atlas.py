@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wildgs.data import View
 from wildgs.light.photos import encode_view
 from wildgs.model.appearance import Embeddings
 from wildgs.model.wildgs import WildGS
+from wildgs.scene import View
 
 MAX_PHOTOS = 200
 """Photos that are looked at; of larger collections as many, evenly spread over the names."""

@@ -7,10 +7,10 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from wildgs.data import View, find_view, match_view
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
 from wildgs.model.method import Method
+from wildgs.scene import View, find_view, match_view
 
 __all__ = ["cover", "encode_photo", "encode_picture", "encode_view", "find_view", "match_view"]
 

@@ -13,10 +13,6 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from wildgs.data import Scene, View, find_view, match_view
-from wildgs.data.images import UnreadableImageError, read_photo
-from wildgs.data.landmarks import Landmarks, load_landmarks
-from wildgs.data.localize import LocalizationError, localize
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.light.atlas import Atlas, make_atlas
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
@@ -24,6 +20,10 @@ from wildgs.light.photos import encode_photo, encode_picture, encode_view
 from wildgs.light.saved import SUFFIX, load_look
 from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
+from wildgs.scene import Scene, View, find_view, match_view
+from wildgs.scene.images import UnreadableImageError, read_photo
+from wildgs.sfm.feature_index import FeatureIndex, load_feature_index
+from wildgs.sfm.localization import LocalizationError, localize
 
 AUTO = "auto"
 """As `like`: the training photo whose global embedding is nearest."""
@@ -54,7 +54,7 @@ class LightSources:
         self.method = method
         self._open_scene = open_scene
         self._landmark_cache = landmark_cache
-        self._landmarks: Landmarks | None = None
+        self._landmarks: FeatureIndex | None = None
         self._kept: OrderedDict[tuple[str, str | None], Look] = OrderedDict()
         self._atlas: Atlas | None = None
 
@@ -129,7 +129,7 @@ class LightSources:
     def _locate(self, method: WildGS, file: Path, progress: Progress) -> Look:
         """The look of a new photo of the place."""
         if self._landmarks is None:
-            self._landmarks = load_landmarks(
+            self._landmarks = load_feature_index(
                 self.scene.root,
                 self._landmark_cache,
                 lambda done, total: progress("finding features of the scene's photos", done, total),

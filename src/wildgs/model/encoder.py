@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from wildgs.data.hub import hub_reachable
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.hub import hub_reachable
 
 if TYPE_CHECKING:
     from transformers import ResNetModel

@@ -15,7 +15,7 @@ def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tenso
     """Geometry of the ground's Gaussians.
 
     Args:
-        points: Their centres in the aligned frame, +z up (`wildgs.data.ground`).
+        points: Their centres in the aligned frame, +z up (`wildgs.priors.ground`).
         spacing: Distance between neighbours.
 
     Returns:

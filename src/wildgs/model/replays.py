@@ -69,7 +69,7 @@ class Replays:
         return len(self._graphs)
 
     def switch(self, on: bool) -> None:
-        """Turns recording on or off; off forgets what was recorded."""
+        """Turns recording on or off, and forgets what was recorded."""
         self.on = on
         self._calls.clear()
         self._graphs.clear()
@@ -116,24 +116,20 @@ def _record(part: _Part, x: Tensor, memory: Any) -> Callable[[Tensor], Outputs]:
     Raises:
         RuntimeError: It cannot be recorded, or gives other numbers.
     """
-    wanted = _values_and_gradients(part, x)
+    learnt = [parameter for parameter in part.parameters() if parameter.requires_grad]
+    wanted = _values_and_gradients(part, x, learnt)
     # The graph keeps its example as the place from which it reads.
     recorded = torch.cuda.make_graphed_callables(part, (x.clone(),), allow_unused_input=True, pool=memory)
     graph = cast(Callable[[Tensor], Outputs], recorded)
-    found = _values_and_gradients(graph, x, part.parameters())
-    if not _alike(wanted, found):
+    if not _alike(wanted, _values_and_gradients(graph, x, learnt)):
         raise RuntimeError("a replay gives other numbers")
     return graph
 
 
 def _values_and_gradients(
-    part: Callable[[Tensor], Outputs], x: Tensor, parameters: Iterable[nn.Parameter] | None = None
+    part: Callable[[Tensor], Outputs], x: Tensor, learnt: Sequence[nn.Parameter]
 ) -> list[Tensor | None]:
     outputs = part(x)
-    if parameters is None:
-        assert isinstance(part, nn.Module)
-        parameters = part.parameters()
-    learnt = [parameter for parameter in parameters if parameter.requires_grad]
     objective = torch.stack([output.float().square().mean() for output in outputs]).sum()
     gradients = torch.autograd.grad(objective, learnt, allow_unused=True)
     return [None if value is None else value.detach().clone() for value in (*outputs, *gradients)]

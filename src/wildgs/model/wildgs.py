@@ -10,8 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from wildgs.data.depth_points import DepthPointsConfig
-from wildgs.data.ground import GroundConfig
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.color_match import match_colors
@@ -27,6 +25,8 @@ from wildgs.model.sky import COLOR as SKY_COLOR
 from wildgs.model.sky import SkyConfig, sky_rows
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, WrappingConfig
+from wildgs.priors.depth_points import DepthPointsConfig
+from wildgs.priors.ground import GroundConfig
 from wildgs.rasterize import Projection, blend
 
 ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
@@ -104,8 +104,8 @@ class WildGS(Method):
             points: SfM points; the triplane covers the central part of them.
             colors: Their colours.
             encoder: Overrides the encoder that `config` names.
-            dense: Further points with colours, for Gaussians alone (`wildgs.data.depth_points`).
-            ground: Where the ground goes on (`wildgs.data.ground`).
+            dense: Further points with colours, for Gaussians alone (`wildgs.priors.depth_points`).
+            ground: Where the ground goes on (`wildgs.priors.ground`).
         """
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(points, config.wrapping.box_quantile, ratio)

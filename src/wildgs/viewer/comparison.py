@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from wildgs.data import View
 from wildgs.evaluation.metrics import psnr
 from wildgs.export.depth_colors import color_depth
 from wildgs.light.look import Look
+from wildgs.scene import View
 from wildgs.viewer.subject import Subject
 
 LONG_SIDE = 480

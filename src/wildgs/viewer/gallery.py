@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import UInt8
 
-from wildgs.data import View
 from wildgs.errors import UserError
+from wildgs.scene import View
 from wildgs.viewer.markup import jpeg_uri, thumbnail
 
 AT_ONCE = 4

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from wildgs.data import View
+from wildgs.scene import View
 from wildgs.viewer.cameras import fov_that_holds, pose_of
 from wildgs.viewer.comparison import Comparison
 from wildgs.viewer.gallery import Gallery

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from wildgs.data import Scene, View, match_view
 from wildgs.engine.trainer import Trainer
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
@@ -20,6 +19,7 @@ from wildgs.light.sources import LightSources
 from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
 from wildgs.rasterize import Rendering, blend, sh_to_colors
+from wildgs.scene import Scene, View, match_view
 
 
 @runtime_checkable

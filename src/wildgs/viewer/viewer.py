@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from wildgs.data import Scene, View
 from wildgs.errors import UserError
 from wildgs.geometry.lens import focus
 from wildgs.model.gaussians import NEAR
+from wildgs.scene import Scene, View
 from wildgs.viewer.cameras import ViserCamera, pose_of
 from wildgs.viewer.comparison import compare
 from wildgs.viewer.display import Paint, SplatDisplay

@@ -1,0 +1,212 @@
+"""COLMAP models, binary or text, in the folder layouts that photo-tourism data comes in."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.scene.colmap_binary import read_binary
+from wildgs.scene.colmap_records import ImageRecord, ModelFileError, ModelRecords, PointRecords
+from wildgs.scene.colmap_text import read_text
+
+LAYOUTS = (
+    ("sparse/0", "images"),
+    ("sparse", "images"),
+    ("dense/sparse/0", "dense/images"),
+    ("dense/sparse", "dense/images"),
+)
+"""Folders of a model and of its photos, relative to the scene; the first that holds a model counts."""
+
+MAX_COORDINATE = 1e12
+"""Poses and points beyond it (in model units) are damage: single precision ends soon after."""
+
+MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One registered photo as the model has it.
+
+    Attributes:
+        name: Path relative to the image folder, with forward slashes.
+        camera: pycolmap's camera (any model), for the stored pixel grid of the photo.
+        viewmat: World-to-camera in the model's own frame.
+        median_depth: Median depth of the points that this photo observes, None where it observes none.
+    """
+
+    name: str
+    camera: Any
+    viewmat: Float[Tensor, "4 4"]
+    median_depth: float | None
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A sparse model: photos with poses, sorted by name, and finite points."""
+
+    images_dir: Path
+    images: tuple[ColmapImage, ...]
+    points: Float[Tensor, "P 3"]
+    point_colors: UInt8[Tensor, "P 3"]
+
+
+def find_model(root: Path) -> tuple[Path, Path]:
+    """The folders of a scene's sparse model and of its photos.
+
+    Raises:
+        UserError: There is no scene, no model or no folder of photos.
+    """
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder; give the folder of a COLMAP scene (images/ and sparse/0/)")
+    for sparse, images in LAYOUTS:
+        model = root / sparse
+        if any(all((model / name).is_file() for name in names) for names in MODEL_FILES):
+            if not (root / images).is_dir():
+                raise UserError(f"{root / images}: no such folder; the photos of {model} belong there")
+            return model, root / images
+    raise UserError(
+        f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or"
+        " dense/sparse; `wildgs sfm PHOTOS --output SCENE` makes one"
+    )
+
+
+def read_model(root: Path) -> ColmapModel:
+    """Read the sparse model of a scene folder.
+
+    Args:
+        root: The scene's folder.
+
+    Returns:
+        All photos with a pose, in the order of their names, and the points with finite coordinates, in the
+        model's own frame (double precision).
+
+    Raises:
+        UserError: The model is missing, cannot be read, holds no photo with a pose or no point.
+    """
+    folder, images_dir = find_model(root)
+    binary = all((folder / name).is_file() for name in MODEL_FILES[0])
+    try:
+        records = read_binary(folder) if binary else read_text(folder)
+    except (ModelFileError, OSError, MemoryError) as error:
+        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
+    registered = _usable(records, folder)
+    with np.errstate(invalid="ignore"):
+        finite = np.all(np.abs(records.points.xyz) < MAX_COORDINATE, axis=1)
+    if not finite.any():
+        raise UserError(
+            f"{folder}: the COLMAP model holds no points, and training starts from them; triangulate it"
+        )
+    viewmats = {image.image_id: _viewmat(image) for image in registered}
+    depths = _median_depths(records.points, finite, viewmats)
+    images = tuple(
+        ColmapImage(
+            name=_checked_name(image.name, folder),
+            camera=records.cameras[image.camera_id],
+            viewmat=torch.from_numpy(viewmats[image.image_id]),
+            median_depth=depths.get(image.image_id),
+        )
+        for image in registered
+    )
+    _refuse_repeated([image.name for image in images], folder)
+    points, colors = records.points.xyz[finite], records.points.rgb[finite]
+    return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors))
+
+
+def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
+    """Photos with a camera and a pose that mean something, by name; the others are named in a warning."""
+    images = sorted(records.images, key=lambda image: image.name)
+    if not images:
+        raise UserError(
+            f"{folder}: the COLMAP model holds no photo with a pose; run `wildgs sfm` on the photos"
+        )
+    if len({image.image_id for image in images}) != len(images):
+        raise UserError(f"{folder}: two photos of the COLMAP model have one id; make it anew")
+    faults = {image.name: fault for image in images if (fault := _fault(image, records.cameras))}
+    good = [image for image in images if image.name not in faults]
+    described = describe_names([f"{name!r} ({fault})" for name, fault in faults.items()])
+    if not good:
+        raise UserError(f"{folder}: no photo of the COLMAP model can be used: {described}; make it anew")
+    if faults:
+        warnings.warn(
+            f"{folder}: {len(faults)} photos cannot be used and are left out: {described}",
+            WildGSWarning,
+            stacklevel=3,
+        )
+    return good
+
+
+def _fault(image: ImageRecord, cameras: dict[int, Any]) -> str | None:
+    """Why a photo cannot be used, or None."""
+    camera = cameras.get(image.camera_id)
+    if camera is None:
+        return f"there is no camera {image.camera_id}"
+    params = np.array(camera.params)
+    if not np.isfinite(params).all() or not all(params[i] > 0 for i in camera.focal_length_idxs()):
+        return "its camera's parameters make no sense"
+    pose = np.array([*image.quat, *image.translation])
+    if not np.isfinite(pose).all() or np.abs(pose).max() > MAX_COORDINATE:
+        return "its pose is no finite number"
+    return None if np.linalg.norm(image.quat) > 1e-12 else "its rotation is zero"
+
+
+def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
+    repeated = sorted({a for a, b in itertools.pairwise(names) if a == b})
+    if repeated:
+        raise UserError(f"{folder}: the photo {repeated[0]!r} is in the COLMAP model twice; make it anew")
+
+
+def _checked_name(name: str, folder: Path) -> str:
+    """A photo's name that stays within the image folder: other files are found, and written, by it."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    outside = path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0])
+    if outside or not path.name or any(character < " " for character in name):
+        raise UserError(
+            f"{folder}: the photo {name!r} lies outside the image folder; give it a name within it"
+        )
+    return str(path)
+
+
+def _viewmat(image: ImageRecord) -> np.ndarray:
+    quat = torch.tensor(image.quat, dtype=torch.float64)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = quats_to_rotations(quat[None] / quat.norm())[0].numpy()
+    viewmat[:3, 3] = image.translation
+    return viewmat
+
+
+def _median_depths(
+    points: PointRecords, finite: np.ndarray, viewmats: dict[int, np.ndarray]
+) -> dict[int, float]:
+    """Median depth of each photo's own points (those in its tracks), model units."""
+    rows, photos = points.track_point, points.track_image
+    known = finite[rows]
+    rows, photos = rows[known], photos[known]
+    if len(rows) == 0:
+        return {}
+    order = np.argsort(photos, kind="stable")
+    ids, starts = np.unique(photos[order], return_index=True)
+    depths = {}
+    for image_id, seen in zip(ids.tolist(), np.split(rows[order], starts[1:]), strict=True):
+        if image_id in viewmats:
+            row = viewmats[image_id][2]
+            depth = points.xyz[seen] @ row[:3] + row[3]
+            if (depth > 0).any():
+                depths[image_id] = float(np.median(depth[depth > 0]))
+    return depths
+
+
+def describe_names(names: Sequence[str], limit: int = 3) -> str:
+    """The first few names for a message, with how many more there are."""
+    shown = ", ".join(names[:limit])
+    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"

@@ -1,0 +1,228 @@
+"""Where was this photo taken? The camera of a new photo of a scene, from the scene's own SfM model.
+
+SIFT features are matched to the model's points, and the pose comes from RANSAC and refinement by pycolmap. The
+focal length is that of the EXIF block, or estimated with the pose.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import torch
+from jaxtyping import Float64, UInt8
+from PIL import Image
+from torch import Tensor
+
+from wildgs.errors import UserError
+from wildgs.geometry.camera import Camera
+from wildgs.scene.images import UnreadableImageError, open_image, read_photo
+from wildgs.scene.scene import Alignment
+from wildgs.scene.undistort import PixelGrid, sample_colors
+from wildgs.sfm.feature_index import MAX_IMAGE_SIZE, FeatureIndex, match_features
+from wildgs.sfm.mapping import quiet
+from wildgs.sfm.upright import save_jpeg
+
+MIN_INLIERS = 15
+"""Fewer points that agree with a pose may do so by chance: photos of other places reach 5."""
+
+MATCH_RATIO = 0.85
+MAX_ERROR = 0.008
+"""Largest reprojection error of an inlier, as a share of the photo's long side (8 pixels of 1,000)."""
+
+REFINE_LENS = 60
+"""Inliers from which the lens's distortion is estimated too."""
+
+EXIF_SIDE = 256
+"""Pixels of the picture that carries an EXIF block: focal lengths are relative to the sides."""
+
+FOCAL_RANGE = (0.3, 30.0)
+"""Focal lengths of photographs, relative to the long side; a pose that needs another is wrong."""
+
+MAX_DISTORTION = 0.2
+"""Largest shift of a photo's corners by its lens, relative to their distance from the middle."""
+
+
+class LocalizationError(UserError):
+    """The photo could not be placed in the scene; the message says how far it got."""
+
+
+@dataclass(frozen=True)
+class LocalizedPhoto:
+    """A new photo with its camera.
+
+    Attributes:
+        photo: Undistorted, at the size at which the scene's photos are used.
+        camera: Its pinhole camera in the scene's aligned frame.
+        inliers: Points of the model that the pose explains.
+        matches: Points that the photo seemed to show.
+        focal: Focal length, relative to the long side.
+        focal_from_exif: Whether the search began at the EXIF block's focal length.
+    """
+
+    photo: UInt8[Tensor, "H W 3"]
+    camera: Camera
+    inliers: int
+    matches: int
+    focal: float
+    focal_from_exif: bool
+
+    def describe(self) -> str:
+        """A line for the user."""
+        origin = "from EXIF, refined" if self.focal_from_exif else "estimated"
+        return (
+            f"localised with {self.inliers} inliers of {self.matches} matches, focal length"
+            f" {self.focal:.2f} of the long side ({origin})"
+        )
+
+
+def localize(
+    file: Path, landmarks: FeatureIndex, alignment: Alignment, long_side: int, *, seed: int = 0
+) -> LocalizedPhoto:
+    """Finds the camera of a photo of the place.
+
+    Args:
+        file: The photo; any size, upright or with an EXIF orientation.
+        landmarks: Of the scene.
+        alignment: From the model's frame to the scene's aligned one.
+        long_side: Pixels to which the photo is shrunk for use.
+        seed: Of RANSAC.
+
+    Raises:
+        UserError: The file cannot be read.
+        LocalizationError: Too little of the photo agrees with the scene.
+    """
+    try:
+        pixels = read_photo(file).pixels
+    except UnreadableImageError as error:
+        raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
+    camera, known = guess_camera(file, pixels.shape[1], pixels.shape[0])
+    features, descriptors = _features(pixels)
+    matched, seen = (np.zeros(0, np.int64),) * 2
+    if len(features):
+        matched, seen = match_features(descriptors, landmarks, MATCH_RATIO)
+    answer = _solve(features[matched], landmarks.points[seen], camera, known, seed)
+    inliers = 0 if answer is None else int(answer["num_inliers"])
+    if answer is None or inliers < MIN_INLIERS:
+        raise LocalizationError(
+            f"{file}: could not be localised ({inliers} inliers of {len(matched)} matches with the scene's"
+            f" points; at least {MIN_INLIERS} are needed)"
+        )
+    return _as_view(
+        pixels, camera, answer["cam_from_world"], alignment, long_side, inliers, len(matched), known
+    )
+
+
+def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
+    """A camera with the EXIF block's focal length where it has one, and whether it has.
+
+    COLMAP (in C++, in the trainer's own process where a viewer asks) sees no byte of the file: only the entries
+    that Pillow could read, written anew beside a small empty picture of the same shape.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as folder, open_image(file) as image, quiet():
+            blank = Image.new("RGB", (width, height))
+            blank.thumbnail((EXIF_SIDE, EXIF_SIDE))
+            save_jpeg(blank, image, Path(folder) / "exif.jpg")
+            read = pycolmap.infer_camera_from_image(Path(folder) / "exif.jpg")
+        known = bool(read.has_prior_focal_length)
+        focal = read.mean_focal_length() / max(read.width, read.height)
+    except Exception:  # no EXIF block that makes sense
+        known, focal = False, 1.2
+    long_side = max(width, height)
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL",
+        width=width,
+        height=height,
+        params=[focal * long_side, width / 2, height / 2, 0.0],
+    )
+    return camera, known
+
+
+def _features(
+    pixels: UInt8[np.ndarray, "H W 3"],
+) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
+    """SIFT features in the photo's pixels, and their descriptors."""
+    height, width = pixels.shape[:2]
+    grey = Image.fromarray(pixels).convert("L")
+    grey.thumbnail((MAX_IMAGE_SIZE, MAX_IMAGE_SIZE), Image.Resampling.LANCZOS)
+    with quiet():
+        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+        keypoints, descriptors = extractor.extract_from_uint8_array(np.asarray(grey))
+    found = np.array([(point.x, point.y) for point in keypoints], dtype=np.float64).reshape(-1, 2)
+    return found * [width / grey.width, height / grey.height], np.array(descriptors.data)
+
+
+def _solve(
+    pixels: Float64[np.ndarray, "M 2"],
+    points: Float64[np.ndarray, "M 3"],
+    camera: Any,
+    known: bool,
+    seed: int,
+) -> dict[str, Any] | None:
+    """The pose, None where there is none that a photograph could have.
+
+    The camera's focal length is refined in place, and with enough points its distortion.
+    """
+    if len(pixels) < 4:
+        return None
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    estimation.estimate_focal_length = not known
+    estimation.ransac.max_error = MAX_ERROR * max(camera.width, camera.height)
+    estimation.ransac.random_seed = seed
+    estimation.ransac.min_inlier_ratio = 0.02
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.refine_focal_length = True
+    with quiet():
+        answer = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, estimation, refinement)
+        if answer is None or not _plausible(camera):
+            return None
+        if answer["num_inliers"] >= REFINE_LENS:
+            refinement.refine_extra_params = True
+            bent = pycolmap.Camera(camera.todict())
+            pose, inliers = answer["cam_from_world"], answer["inlier_mask"]
+            refined = pycolmap.refine_absolute_pose(pose, pixels, points, inliers, bent, refinement)
+            if refined is not None and _plausible(bent):
+                answer["cam_from_world"] = refined["cam_from_world"]
+                camera.params = bent.params
+    return answer
+
+
+def _plausible(camera: Any) -> bool:
+    focal, radial = camera.params[0], camera.params[3]
+    corner = np.hypot(camera.width, camera.height) / 2 / focal
+    in_range = FOCAL_RANGE[0] <= focal / max(camera.width, camera.height) <= FOCAL_RANGE[1]
+    return bool(in_range and abs(radial) * corner**2 <= MAX_DISTORTION)
+
+
+def _as_view(
+    pixels: UInt8[np.ndarray, "H W 3"],
+    camera: Any,
+    pose: Any,
+    alignment: Alignment,
+    long_side: int,
+    inliers: int,
+    matches: int,
+    known: bool,
+) -> LocalizedPhoto:
+    """The photo as the scene's own are: pinhole, aligned, of their size."""
+    longest = max(camera.width, camera.height)
+    grid = PixelGrid.from_colmap(camera, max(1.0, longest / long_side))
+    image = Image.fromarray(pixels).resize(grid.resized, Image.Resampling.LANCZOS)
+    source = grid.source()
+    photo = np.array(image) if source is None else sample_colors(np.asarray(image), source)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.from_numpy(pose.matrix())
+    placed = alignment.apply_camera(Camera(viewmat, grid.K, grid.width, grid.height))
+    return LocalizedPhoto(
+        photo=torch.from_numpy(photo),
+        camera=replace(placed, viewmat=placed.viewmat.float(), K=placed.K.float()),
+        inliers=inliers,
+        matches=matches,
+        focal=float(camera.params[0]) / longest,
+        focal_from_exif=known,
+    )

@@ -1,0 +1,192 @@
+"""`reconstruct`: a folder of photos becomes a COLMAP scene (structure from motion with pycolmap)."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+from PIL import Image
+
+from wildgs.errors import UserError
+from wildgs.scene.colmap import LAYOUTS
+from wildgs.scene.images import read_mask
+from wildgs.scene.undistort import PixelGrid, sample_mask
+from wildgs.sfm.mapping import (
+    Progress,
+    SfmConfig,
+    Workplace,
+    extract,
+    find_registered,
+    image_ids,
+    map_photos,
+    match,
+    quiet,
+)
+from wildgs.sfm.pairs import PairingConfig
+from wildgs.sfm.report import REPORT_NAME, SfmReport
+from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
+
+__all__ = ["PairingConfig", "Progress", "SfmConfig", "SfmReport", "reconstruct"]
+
+
+def reconstruct(
+    photos: Path,
+    output: Path,
+    config: SfmConfig | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> SfmReport:
+    """Find the cameras of a folder of photos and write a scene that `load_scene` reads.
+
+    Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental, and
+    the largest model is kept and undistorted. CUDA is used where pycolmap was built with it.
+
+    Args:
+        photos: Folder of photos, sub-folders included. It is only read.
+        output: Scene folder to write: `images/`, `sparse/0/`, `masks/` where photos have transparent pixels,
+            and `sfm_report.json`. It appears only when all is done.
+        config: Limits; the defaults where None.
+        overwrite: Replace the scene that an earlier run left in `output`.
+        progress: Told about every step.
+
+    Returns:
+        Which photos were registered, and why the others were not.
+
+    Raises:
+        UserError: There are fewer than two readable photos, they do not match, or `output` is in use.
+    """
+    config, progress = config or SfmConfig(), progress or (lambda stage, done, total: None)
+    photos, output = Path(photos), Path(output)
+    started = time.perf_counter()
+    _check_output(photos, output, overwrite)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.sfm.") as folder, quiet():
+        work = Workplace(Path(folder))
+        copies, broken = copy_upright(
+            photos,
+            work.images,
+            work.masks,
+            max_pixels=config.max_image_pixels,
+            progress=lambda done, total: progress("reading photos", done, total),
+        )
+        if len(copies) < 2:
+            raise UserError(
+                f"{photos}: holds {len(copies)} photo(s) that can be read; poses need at least two of the"
+                " same place, better twenty"
+            )
+        pycolmap.set_random_seed(config.seed)
+        extract(work, copies, config, progress)
+        pairing = match(work, copies, config, progress)
+        models = map_photos(work, photos, len(copies), config, progress)
+        progress("undistorting", 0, 0)
+        _write_scene(work, copies, models[0])
+        report = SfmReport(
+            photos=len(copies) + len(broken),
+            registered=tuple(
+                sorted(c.scene_name for c in copies if find_registered(models[0], c) is not None)
+            ),
+            left_out={**broken, **_reasons(work, copies, models)},
+            points=models[0].num_points3D(),
+            reprojection_error=float(models[0].compute_mean_reprojection_error()),
+            pairing=pairing.name,
+            pairs=len(pairing.pairs),
+            models=tuple(model.num_reg_images() for model in models),
+            seconds=time.perf_counter() - started,
+        )
+        report.write(work.scene)
+        _move_in(work.scene, output)
+    return report
+
+
+def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
+    """Never write over photos or models that another program, or the user, put there."""
+    if output.exists() and not output.is_dir():
+        raise UserError(f"{output}: is a file; give a folder for the scene")
+    folders = ("images", "masks", *(sparse for sparse, _ in LAYOUTS))
+    taken = [name for name in folders if (output / name).exists()]
+    if not taken:
+        return
+    if photos.resolve().is_relative_to(output.resolve()):
+        raise UserError(f"{output}: the photos lie in this folder, which would be written over; give another")
+    if not (output / REPORT_NAME).is_file():
+        raise UserError(f"{output}: holds {taken[0]}/ that `wildgs sfm` did not make; give another folder")
+    if not overwrite:
+        raise UserError(f"{output}: already holds a scene; give another folder, or --overwrite")
+
+
+def _move_in(scene: Path, output: Path) -> None:
+    """Put the finished scene in its place; other files in `output` stay."""
+    output.mkdir(exist_ok=True)
+    aside = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}.old."))
+    try:
+        for name in ("images", "sparse", "masks", REPORT_NAME):
+            if (output / name).exists():
+                (output / name).rename(aside / name)
+        for item in scene.iterdir():
+            item.rename(output / item.name)
+    finally:
+        shutil.rmtree(aside)
+
+
+def _write_scene(work: Workplace, copies: Sequence[WorkingCopy], model: Any) -> None:
+    """Undistort the photos of the model and give them their names back."""
+    kept, dense = work.root / "kept", work.root / "dense"
+    kept.mkdir()
+    model.write(kept)
+    pycolmap.undistort_images(dense, kept, work.images, jpeg_quality=JPEG_QUALITY)
+    pinhole = pycolmap.Reconstruction(dense / "sparse")
+    for copy in copies:
+        image, original = find_registered(pinhole, copy), find_registered(model, copy)
+        if image is None or original is None:
+            continue
+        image.name = copy.scene_name
+        target = work.scene / "images" / copy.scene_name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (dense / "images" / copy.work_name).rename(target)
+        if copy.masked:
+            _write_mask(work, copy, original.camera)
+    (work.scene / "sparse" / "0").mkdir(parents=True)
+    pinhole.write(work.scene / "sparse" / "0")
+
+
+def _write_mask(work: Workplace, copy: WorkingCopy, camera: Any) -> None:
+    grid = PixelGrid.from_colmap(camera, 1)
+    mask = read_mask(work.masks / f"{copy.work_name}.png", grid.resized)
+    source = grid.source()
+    target = work.scene / "masks" / f"{copy.scene_name}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(mask if source is None else sample_mask(mask, source)).save(target)
+
+
+def _reasons(work: Workplace, copies: Sequence[WorkingCopy], models: Sequence[Any]) -> dict[str, str]:
+    """Why the photos without a pose in the kept model have none."""
+    with closing(pycolmap.Database.open(work.database)) as database:
+        ids = image_ids(database, copies)
+        names = {image_id: copy.name for image_id, copy in zip(ids, copies, strict=True)}
+        best: dict[int, tuple[int, int]] = {}
+        for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            best[a] = max(best.get(a, (0, 0)), (inliers, b))
+            best[b] = max(best.get(b, (0, 0)), (inliers, a))
+        reasons = {}
+        for image_id, copy in zip(ids, copies, strict=True):
+            if find_registered(models[0], copy) is not None:
+                continue
+            other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
+            inliers, partner = best.get(image_id, (0, 0)) if image_id is not None else (0, 0)
+            if image_id is None or database.num_keypoints_for_image(image_id) == 0:
+                reasons[copy.name] = "no features found (blank, blurred or very small)"
+            elif other is not None:
+                reasons[copy.name] = f"belongs to a separate group of {other.num_reg_images()} photos"
+            elif inliers == 0:
+                reasons[copy.name] = "matches no other photo"
+            else:
+                reasons[copy.name] = f"too few matches ({inliers} at best, with {names[partner]})"
+    return reasons

@@ -1,0 +1,138 @@
+"""A wall seen by five photos, of which SfM knows the upper half only; a passer-by stands before it in one photo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wildgs.geometry.camera import Camera
+from wildgs.priors.depth_points import DepthPointsConfig, depth_points, fit_disparity
+from wildgs.scene import Alignment, Scene, View
+
+SIDE, WALL = 64, 2.0
+CONFIG = DepthPointsConfig(cell=0.1)
+
+
+def camera(index: int) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = 0.1 * (index - 2)
+    K = torch.tensor([[60.0, 0, SIDE / 2], [0, 60.0, SIDE / 2], [0, 0, 1]])
+    return Camera(viewmat, K, SIDE, SIDE)
+
+
+def view(index: int, depth: torch.Tensor, mask: torch.Tensor | None = None) -> View:
+    scale, shift = 0.3 + 0.2 * index, 0.1 * index
+    return View(
+        name=f"{index}.png",
+        camera=camera(index),
+        split="train",
+        read_photo=lambda: torch.full((SIDE, SIDE, 3), 10 * index, dtype=torch.uint8),
+        read_mask=lambda: mask,
+        read_disparity=lambda: scale / depth + shift,
+        read_clean=lambda: None,
+        read_truth_mask=lambda: None,
+    )
+
+
+def relief() -> torch.Tensor:
+    """Depth of the wall: the upper half leans back, so that it tells the scale of a disparity."""
+    depth = torch.full((SIDE, SIDE), WALL)
+    depth[: SIDE // 2] += 0.5 * torch.linspace(1, 0, SIDE // 2)[:, None]
+    return depth
+
+
+def scene(views: list[View] | None = None) -> Scene:
+    if views is None:
+        views = [view(index, relief()) for index in range(5)]
+    known = camera(2).unproject(relief())[: SIDE // 2 : 2, ::2].reshape(-1, 3)
+    colors = torch.zeros(len(known), 3, dtype=torch.uint8)
+    return Scene(Path("wall"), tuple(views), known, colors, Alignment.identity())
+
+
+def test_the_wall_is_filled_where_sfm_has_nothing() -> None:
+    points, colors = depth_points(scene(), CONFIG)
+    lower = points[:, 1] > 0.05
+    assert lower.sum() > 50
+    assert (points[lower, 2] - WALL).abs().max() < 0.02
+    assert points[:, 1].max() > 0.9
+    assert ((colors.float() - 20).abs() <= 10).all()
+
+
+def test_what_sfm_knows_is_not_doubled() -> None:
+    known = scene()
+    points, _ = depth_points(known, CONFIG)
+    cells = {tuple(c) for c in (known.points / CONFIG.cell).floor().long().tolist()}
+    assert not cells & {tuple(c) for c in (points / CONFIG.cell).floor().long().tolist()}
+
+
+def test_who_passes_by_in_one_photo_is_left_out() -> None:
+    passed = relief()
+    passed[40:60, 20:44] = 1.0
+    views = [view(index, passed if index == 2 else relief()) for index in range(5)]
+    assert (depth_points(scene(views), CONFIG)[0][:, 2] > 1.9).all()
+    alone = replace(CONFIG, support=1, agreement=0.0)
+    assert (depth_points(scene(views), alone)[0][:, 2] < 1.1).any(), "this is what would have stood there"
+
+
+def test_what_three_photos_show_and_more_see_through_is_left_out() -> None:
+    """A coach that stood there for three photos of nine."""
+    stood = relief()
+    stood[40:60, 20:44] = 1.0
+    nine = [view(2, stood)] * 3 + [view(index % 5, relief()) for index in range(6)]
+    strict = replace(CONFIG, agreement=0.6)
+    assert (depth_points(scene(nine), strict)[0][:, 2] > 1.9).all()
+    assert (depth_points(scene(nine), replace(CONFIG, agreement=0.0))[0][:, 2] < 1.1).any()
+
+
+def test_a_users_mask_is_heeded() -> None:
+    mask = torch.full((SIDE, SIDE), 255, dtype=torch.uint8)
+    mask[SIDE // 2 :] = 0
+    views = [view(index, relief(), mask) for index in range(5)]
+    points, _ = depth_points(scene(views), CONFIG)
+    assert not (points[:, 1] > 0.2).any()
+
+
+def test_no_more_points_than_asked_for_and_the_same_ones_again() -> None:
+    few = replace(CONFIG, points=17)
+    points, colors = depth_points(scene(), few)
+    assert len(points) == len(colors) == 17
+    torch.testing.assert_close(depth_points(scene(), few)[0], points, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, points=0)])
+def test_without_depth_priors_or_use_for_them_there_are_none(config: DepthPointsConfig) -> None:
+    views = [replace(each, read_disparity=lambda: None) if config.points else each for each in scene().views]
+    points, colors = depth_points(scene(views), config)
+    assert points.shape == colors.shape == (0, 3)
+
+
+def test_disparity_that_is_noise_is_passed_over() -> None:
+    noise = torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(0)) + 0.1
+    views = [replace(each, read_disparity=lambda: noise) for each in scene().views]
+    assert len(depth_points(scene(views), CONFIG)[0]) == 0
+
+
+@given(
+    scale=st.floats(0.01, 100), shift=st.floats(-5, 5), outliers=st.floats(0, 0.5), seed=st.integers(0, 2**31)
+)
+def test_the_fit_finds_scale_and_shift_among_outliers(
+    scale: float, shift: float, outliers: float, seed: int
+) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    inverse = torch.rand(200, generator=generator) + 0.2
+    disparity = (inverse - shift) / scale
+    wrong = torch.rand(200, generator=generator) < outliers
+    measured = torch.where(wrong, inverse * (0.3 + 0.5 * torch.rand(200, generator=generator)), inverse)
+    fit = fit_disparity(disparity, measured, generator)
+    assert fit is not None
+    torch.testing.assert_close(fit[0] * disparity + fit[1], inverse, rtol=0.04, atol=0.0)
+
+
+def test_far_that_is_large_is_no_disparity() -> None:
+    inverse = torch.linspace(0.2, 1, 100)
+    assert fit_disparity(1 - inverse, inverse, torch.Generator().manual_seed(0)) is None

@@ -1,0 +1,180 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.scene import DataConfig, load_scene
+from wildgs.scene.colmap import read_model
+from wildgs.sfm.reconstruction import PairingConfig, SfmConfig, reconstruct
+
+Corner = tuple[list[np.ndarray], list[np.ndarray]]
+EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3))
+
+
+def save_photos(folder: Path, photos: list[np.ndarray], **exif: Image.Exif) -> Path:
+    folder.mkdir()
+    for index, pixels in enumerate(photos):
+        Image.fromarray(pixels).save(folder / f"photo {index}.jpg", quality=95)
+    return folder
+
+
+def camera_centres(scene: Path) -> dict[str, np.ndarray]:
+    return {
+        image.name: (-image.viewmat[:3, :3].T @ image.viewmat[:3, 3]).numpy()
+        for image in read_model(scene).images
+    }
+
+
+def assert_similar(found: np.ndarray, truth: np.ndarray, tolerance: float) -> None:
+    """Equal up to rotation, shift and scale (Umeyama), by the spread of the truth."""
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    u, s, vt = np.linalg.svd(a.T @ b)
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    fitted = a @ (u * sign) @ vt * (s * sign).sum() / (a**2).sum()
+    assert np.abs(fitted - b).max() < tolerance * np.abs(b).max()
+
+
+def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> None:
+    photos, positions = corner
+    folder = save_photos(tmp_path / "my photos", photos[:3])
+    (folder / "phone").mkdir()
+    turned = Image.fromarray(
+        np.rot90(photos[3], 1)
+    )  # stored on its side, with the orientation that rights it
+    exif = turned.getexif()
+    exif[0x0112] = 6
+    turned.save(folder / "phone/photo 3.jpg", quality=95, exif=exif)
+    alpha = np.full(photos[4].shape[:2], 255, dtype=np.uint8)
+    alpha[:, :60] = 0
+    Image.fromarray(np.dstack([photos[4], alpha])).save(folder / "photo 4.png")
+    Image.fromarray(photos[5]).convert("CMYK").save(folder / "photo 5.jpg", quality=98)
+    Image.new("RGB", (320, 240), (90, 90, 90)).save(folder / "blank.jpg")
+    whole = (folder / "photo 0.jpg").read_bytes()
+    (folder / "broken.jpg").write_bytes(whole[: len(whole) // 2])
+    (folder / "notes.txt").write_text("no photo")
+
+    steps: list[tuple[str, int, int]] = []
+    with pytest.warns(WildGSWarning, match=r"broken\.jpg: .*left out"):
+        report = reconstruct(folder, tmp_path / "scene", progress=lambda *step: steps.append(step))
+
+    names = ["phone/photo 3.jpg", "photo 0.jpg", "photo 1.jpg", "photo 2.jpg", "photo 4.jpg", "photo 5.jpg"]
+    assert report.registered == tuple(names)
+    assert report.photos == 8
+    assert set(report.left_out) == {"blank.jpg", "broken.jpg"}
+    assert "no features" in report.left_out["blank.jpg"]
+    assert report.pairing == "exhaustive"
+    assert report.pairs == 21
+    assert ("reading photos", 8, 8) in steps
+    assert steps[-1][0] == "undistorting"
+    assert any("blank.jpg" in line for line in report.lines())
+    stored = json.loads((tmp_path / "scene/sfm_report.json").read_text())
+    assert stored["registered"] == names
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["my photos", "scene"]  # nothing is left behind
+
+    centres = camera_centres(tmp_path / "scene")
+    order = [1, 2, 3, 0, 4, 5]
+    assert_similar(np.stack([centres[names[i]] for i in order]), np.stack(positions), tolerance=0.03)
+
+    scene = load_scene(tmp_path / "scene", DataConfig(holdout=0))
+    assert [view.name for view in scene.views] == names
+    for view in scene.views:
+        assert view.camera.width > view.camera.height  # upright
+        assert view.camera.viewmat[1, 2] < -0.9 or view.camera.up[2] > 0.9
+    mask = scene.views[4].read_mask()
+    assert mask is not None
+    assert (mask[:, :50] == 0).all()
+    assert (mask[:, 70:] == 255).all()
+    assert all(view.read_mask() is None for i, view in enumerate(scene.views) if i != 4)
+
+
+def test_large_sets_are_paired_by_looks(tmp_path: Path, corner: Corner) -> None:
+    report = reconstruct(save_photos(tmp_path / "p", corner[0]), tmp_path / "scene", EAGER)
+    assert report.pairing == "retrieval"
+    assert report.pairs < 15
+    assert len(report.registered) == 6
+
+
+def test_large_sets_with_gps_are_paired_by_it(tmp_path: Path, corner: Corner) -> None:
+    (tmp_path / "p").mkdir()
+    for index, pixels in enumerate(corner[0]):
+        image = Image.fromarray(pixels)
+        exif = image.getexif()
+        exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 53.0, 0.02 * index), 3: "E", 4: (2.0, 20.0, 0.0)})
+        image.save(tmp_path / "p" / f"{index}.jpg", quality=95, exif=exif)
+    report = reconstruct(tmp_path / "p", tmp_path / "scene", EAGER)
+    assert report.pairing == "gps"
+    assert len(report.registered) == 6
+
+
+def test_an_existing_scene_is_replaced_only_on_demand(tmp_path: Path, corner: Corner) -> None:
+    photos = save_photos(tmp_path / "p", corner[0][:4])
+    output = tmp_path / "out"
+    output.mkdir()
+    (output / "keep.txt").write_text("the user's")
+    reconstruct(photos, output)
+    with pytest.raises(UserError, match="already holds a scene"):
+        reconstruct(photos, output)
+    (photos / "photo 3.jpg").unlink()
+    assert len(reconstruct(photos, output, overwrite=True).registered) == 3
+    assert len(list((output / "images").iterdir())) == 3
+    assert (output / "keep.txt").read_text() == "the user's"
+    assert len(load_scene(output).views) == 3
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "p"]
+
+
+def test_folders_of_others_are_never_written_over(tmp_path: Path, corner: Corner) -> None:
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    photos = save_photos(scene / "images", corner[0][:2])
+    with pytest.raises(UserError, match="photos lie in this folder"):
+        reconstruct(photos, scene, overwrite=True)
+    elsewhere = save_photos(tmp_path / "p", corner[0][:2])
+    with pytest.raises(UserError, match="did not make"):
+        reconstruct(elsewhere, scene, overwrite=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="is a file"):
+        reconstruct(elsewhere, tmp_path / "file")
+    assert len(list(photos.iterdir())) == 2
+
+
+def test_photos_of_different_places_end_in_one_line(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0)
+    blots = [np.kron(noise.integers(0, 255, (30, 40, 3)), np.ones((8, 8, 1))) for _ in range(3)]
+    folder = save_photos(tmp_path / "p", [b.astype(np.uint8) for b in blots])
+    with pytest.raises(UserError, match="3 photos do not match each other"):
+        reconstruct(folder, tmp_path / "scene")
+    assert [p.name for p in tmp_path.iterdir()] == ["p"]
+
+
+def test_too_few_photos_end_in_one_line(tmp_path: Path, corner: Corner) -> None:
+    with pytest.raises(UserError, match="no such folder"):
+        reconstruct(tmp_path / "nowhere", tmp_path / "scene")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no photos"):
+        reconstruct(tmp_path / "empty", tmp_path / "scene")
+    with pytest.raises(UserError, match="at least two"):
+        reconstruct(save_photos(tmp_path / "one", corner[0][:1]), tmp_path / "scene")
+
+
+@pytest.mark.shared
+def test_all_of_sacre_coeur_registers(tmp_path: Path, shared: Path) -> None:
+    report = reconstruct(shared / "data/sacre_coeur/images", tmp_path / "scene")
+    assert len(report.registered) == 10
+    assert report.left_out == {}
+    assert report.reprojection_error < 1
+    scene = load_scene(tmp_path / "scene", DataConfig(downscale=4))
+    assert len(scene.points) == report.points > 800
+    assert torch.isfinite(scene.points).all()
+
+
+@pytest.mark.shared
+def test_sacre_coeur_registers_by_retrieval(tmp_path: Path, shared: Path) -> None:
+    config = SfmConfig(pairing=PairingConfig(exhaustive_limit=5, neighbours=6))
+    report = reconstruct(shared / "data/sacre_coeur/images", tmp_path / "scene", config)
+    assert report.pairing == "retrieval"
+    assert report.pairs < 45
+    assert len(report.registered) >= 9
