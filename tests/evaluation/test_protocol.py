@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from wildgs.errors import UserError
-from wildgs.evaluation.lpips_weights import ENVIRONMENT
+from wildgs.evaluation.lpips import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance

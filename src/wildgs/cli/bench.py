@@ -35,7 +35,7 @@ from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import ReportedError, UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
 from wildgs.evaluation.benchmark_table import sections, to_csv, to_markdown, to_records
-from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.lpips import load_lpips
 from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
@@ -78,7 +78,7 @@ class Command:
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run each."""
     lpips: Path | None = None
-    """Folder with LPIPS weights, where they are not in torch's cache."""
+    """Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
     model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)

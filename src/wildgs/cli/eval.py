@@ -30,7 +30,7 @@ class Command:
     protocol: Literal["full", "half", "both"] = "both"
     """Where the light comes from and what is scored."""
     lpips: Path | None = None
-    """Folder with LPIPS weights, where they are not in torch's cache."""
+    """Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet."""
 
 
 def run(command: Command) -> None:

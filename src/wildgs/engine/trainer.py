@@ -20,7 +20,9 @@ from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
 from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
+from wildgs.model.feature_cache import FeatureCache
 from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.parsing import keep_features
 from wildgs.model.precision import (
     Precision,
     choose_precision,
@@ -29,6 +31,7 @@ from wildgs.model.precision import (
     switch_replays,
 )
 from wildgs.scene import Scene, View, scene_extent
+from wildgs.scene.image_cache import parse_bytes
 
 PREPARATION_PHOTOS = 16
 
@@ -42,6 +45,8 @@ class TrainConfig:
         seed: Of everything random.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+        feature_cache: Memory for the frozen encoder's features of training photos; those of further photos are
+            computed again at their turn. No influence on the result.
         objective: Loss weights.
         schedule: What happens when.
         optimizer: Learning rates.
@@ -52,6 +57,7 @@ class TrainConfig:
     seed: int = 0
     precision: Precision = "auto"
     cuda_graphs: bool = True
+    feature_cache: str = "1GB"
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -61,6 +67,7 @@ class TrainConfig:
         """Refuses a run without a step."""
         if self.steps < 1:
             raise UserError(f"steps {self.steps}: must be 1 or more")
+        parse_bytes(self.feature_cache)
 
 
 @dataclass(frozen=True)
@@ -152,6 +159,7 @@ class Trainer:
         finally:
             set_precision(self.method, torch.float32)
             switch_replays(self.method, False)
+            keep_features(self.method, None)
 
     def begin(self) -> None:
         """Gets the method ready for `advance`, the same on all ranks; `run` does it by itself.
@@ -170,6 +178,7 @@ class Trainer:
         self._verify()
         set_precision(self.method, precision)
         switch_replays(self.method, self.config.cuda_graphs)
+        keep_features(self.method, FeatureCache(parse_bytes(self.config.feature_cache)))
 
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""
@@ -201,7 +210,7 @@ class Trainer:
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view), self.feed.keep(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep)
+        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
             self._objective,

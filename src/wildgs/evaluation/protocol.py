@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.evaluation.lpips import LPIPS, MIN_SIDE
-from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.lpips import LPIPS, MIN_SIDE, load_lpips
 from wildgs.evaluation.masks import MaskScore
 from wildgs.evaluation.metrics import psnr, structural_similarity, to_8bit
 from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
@@ -82,7 +81,7 @@ def evaluate(
         run: The run folder.
         step: Training steps that `method` has seen, for the record.
         train_seconds: How long they took, for the record.
-        lpips_folder: LPIPS's weights; None looks where `find_lpips` says.
+        lpips_folder: LPIPS's weights; None takes what `load_lpips` says.
         mask_threshold: Th, for the intersection over union of masks.
         on_view: Told each view's name when it is done.
 

@@ -57,7 +57,8 @@ def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tens
             method: Method = VanillaGS(gaussians)
         else:
             box = Box(torch.zeros(3), torch.ones(3))
-            method = WildGS(config, gaussians, box, load_encoder(None))
+            encoder = load_encoder(config.parsing.encoder, pretrained=False)
+            method = WildGS(config, gaussians, box, encoder)
         method.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
         first = str(error).splitlines()[0]

@@ -30,7 +30,7 @@ class WrappingConfig:
             show get whatever light comes out.
     """
 
-    resolution: int = 128
+    resolution: int = 64
     features: int = 32
     widths: tuple[int, ...] = (16, 32, 64, 64)
     local_size: int = 16
