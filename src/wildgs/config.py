@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import reprlib
 import types
 import typing
@@ -15,12 +14,11 @@ from typing import Any, Literal
 import yaml
 import yaml.composer
 
-from wildgs.engine.trainer import TrainConfig
+from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
-from wildgs.model.registry import MethodName
-from wildgs.model.wildgs import WildGSConfig
-from wildgs.scene import DataConfig
+from wildgs.model.config import MethodName, WildGSConfig
+from wildgs.scene.config import DataConfig
 
 MAX_CONFIG_BYTES = 1_000_000
 
@@ -128,15 +126,13 @@ class _Loader(yaml.SafeLoader):
 
 
 def write_config(path: Path, config: RunConfig) -> None:
-    """Writes YAML, aside and renamed: a reader never sees half of it.
+    """Writes YAML atomically.
 
     Raises:
         UserError: The disk is full, or the folder cannot be written to.
     """
-    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
+    with written_aside(path, flush=True) as aside, aside.open("w", encoding="utf-8") as file:
         yaml.safe_dump(to_plain(config), file, sort_keys=False)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def read_config(path: Path) -> RunConfig:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from wildgs.config import RunConfig, with_entries
-from wildgs.model.encoder import RESNET18
+from wildgs.model.config import RESNET18
 
 PresetName = Literal["default", "paper", "fast"]
 PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)

@@ -10,9 +10,10 @@ from torch.nn import functional
 from transformers import ResNetConfig, ResNetModel
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.model.encoder import RESNET_WIDTHS, SQUEEZENET, FrozenBatchNorm, SqueezeNetEncoder, load_encoder
+from wildgs.model.config import SQUEEZENET, ParsingConfig
+from wildgs.model.encoder import RESNET_WIDTHS, FrozenBatchNorm, SqueezeNetEncoder, load_encoder
 from wildgs.model.feature_cache import FeatureCache, pack, unpack
-from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.parsing import Parsing
 from wildgs.model.precision import lay_out_channels_last, set_precision
 
 

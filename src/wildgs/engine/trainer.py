@@ -5,69 +5,35 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
+from wildgs.engine.config import TrainConfig
+from wildgs.engine.density import DensityControl, DensityReport
 from wildgs.engine.feed import PhotoFeed
-from wildgs.engine.optimizers import OptimizerConfig, Optimizers, sort_rows
+from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.processor import settle_on_cpu
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
-from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
+from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
+from wildgs.losses.objective import Losses, total_loss
 from wildgs.model.feature_cache import FeatureCache
 from wildgs.model.method import Method, TrainingOutput
 from wildgs.model.parsing import keep_features
 from wildgs.model.precision import (
-    Precision,
     choose_precision,
     lay_out_channels_last,
     set_precision,
     switch_replays,
 )
 from wildgs.scene import Scene, View, scene_extent
-from wildgs.scene.image_cache import parse_bytes
+from wildgs.scene.config import parse_bytes
 
 PREPARATION_PHOTOS = 16
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Training.
-
-    Attributes:
-        steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
-        seed: Of everything random.
-        precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
-        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
-        feature_cache: Memory for the frozen encoder's features of training photos; those of further photos are
-            computed again at their turn. No influence on the result.
-        objective: Loss weights.
-        schedule: What happens when.
-        optimizer: Learning rates.
-        density: Densification and pruning.
-    """
-
-    steps: int = 30_000
-    seed: int = 0
-    precision: Precision = "auto"
-    cuda_graphs: bool = True
-    feature_cache: str = "1GB"
-    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    density: DensityConfig = field(default_factory=DensityConfig)
-
-    def __post_init__(self) -> None:
-        """Refuses a run without a step."""
-        if self.steps < 1:
-            raise UserError(f"steps {self.steps}: must be 1 or more")
-        parse_bytes(self.feature_cache)
 
 
 @dataclass(frozen=True)

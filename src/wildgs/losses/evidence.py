@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 COLOR_CELLS = 60
-"""Colours are compared in so many cells along the long side: paving and bricks that the scene has not learnt yet, or
-that are a pixel off, average out; people do not."""
+"""Colours are compared in so many cells along the long side: paving and bricks that the scene has not learnt yet,
+or that are a pixel off, average out; people do not."""
 BRIGHTNESS_SHARE = 0.25
 """Of a difference in brightness against one in colour, squared: light and shadow change the one, people also the
 other."""
@@ -23,7 +23,7 @@ MOST_EVIDENCE = 0.8
 """Limit of the evidence, in units of the image loss: twice λ^M's start, so that what is surely in the way is hidden
 at once."""
 STRUCTURE_SIDE = 240
-"""Structure is compared at about this many pixels along the long side, or at the photo's own size if it is smaller."""
+"""Structure is compared at about this many pixels along the long side, or at the photo's size if it is smaller."""
 STRUCTURE_WINDOWS = 24
 """Windows along the long side in which structure is compared."""
 SAME_STRUCTURE = 0.7
@@ -36,8 +36,8 @@ FLAT = 0.02
 def transient_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     """How much a pixel looks as if something stood in the way, from 0 to `MOST_EVIDENCE`.
 
-    Evidence of colour times the doubt that photo and render show the same structure, which falls linearly from 1 for
-    a structural correlation of 0 or less to 0 for `SAME_STRUCTURE`.
+    The product of `color_evidence` and of the doubt that photo and render show the same structure, which falls
+    linearly from 1 for a structural correlation of 0 or less to 0 for `SAME_STRUCTURE`.
 
     Args:
         photo: I, in 0..1.

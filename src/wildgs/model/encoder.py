@@ -14,14 +14,12 @@ from torch.nn import functional
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.hub import hub_reachable
+from wildgs.model.config import RESNET18, SQUEEZENET
 from wildgs.model.squeezenet import packaged_weights, squeezenet_layers
 
 if TYPE_CHECKING:
     from transformers import ResNetModel
 
-SQUEEZENET = "squeezenet"
-"""The encoder that ships with the package."""
-RESNET18 = "microsoft/resnet-18"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 RESNET_WIDTHS = (64, 64, 128, 256, 512)
