@@ -143,7 +143,7 @@ def _inference(method: Method) -> Iterator[None]:
 
 def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
     """Harmonics under the view's own light, as far as the protocol shows it."""
-    photo, camera, keep = _read_photo(view, device), view.camera.to(device), _read_keep(view, device)
+    (photo, keep), camera = view.load(device), view.camera.to(device)
     if protocol == "half":
         half = photo.shape[1] // 2
         photo, camera = photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height)
@@ -156,10 +156,6 @@ def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Note
     if not colors.isfinite().all():
         notes.add(f"{view.name}: the render holds values that are no numbers, scored as black")
     return to_8bit(colors)
-
-
-def _read_photo(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
-    return view.read_photo().to(device).float() / 255
 
 
 def _score_view(
@@ -240,7 +236,7 @@ def _score_masks(method: Method, scene: Scene, device: torch.device, threshold: 
         truth = view.read_truth_mask()
         if truth is None:
             continue
-        visibility = method.visibility(_read_photo(view, device))
+        visibility = method.visibility(view.load(device)[0])
         if visibility is None:
             return None
         score.add(visibility, truth > 127)
