@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and their names as text."""
 
 from __future__ import annotations
 
@@ -30,3 +30,19 @@ def written_aside(file: Path) -> Iterator[Path]:
             raise
     except OSError as error:
         raise UserError(f"{file} cannot be written ({error}); make room or choose another place") from error
+
+
+def printable(name: str) -> str:
+    r"""A file's name as text that every screen, page and text file can hold.
+
+    Names are bytes on most systems. Bytes that are not UTF-8 and characters that do not print (control characters,
+    reversed writing) are shown as escapes such as `\xe9`.
+    """
+    return "".join(character if character.isprintable() else _escaped(character) for character in name)
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # how Python holds a byte that is not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return character.encode("unicode_escape").decode("ascii")
