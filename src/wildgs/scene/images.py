@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Shaped, UInt8, UInt16
 from PIL import Image
 
+from wildgs.scene.config import MAX_IMAGE_PIXELS
+
 EXIF_ORIENTATION = 0x0112
 TRANSPOSITIONS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -26,9 +28,6 @@ TRANSPOSITIONS = {
 """What makes a picture upright, by its EXIF orientation."""
 ASPECT_TOLERANCE = 0.01
 """Sizes have the same shape when their aspects differ by less than this share (or a pixel's rounding)."""
-
-MAX_IMAGE_PIXELS = 250_000_000
-"""Pictures with more pixels are refused unread: a small file can unpack to more than the memory holds."""
 
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000", "AVIF", "HEIF")
 """What is decoded, whatever a file's name says. Others that Pillow knows start programs (EPS runs Ghostscript)."""

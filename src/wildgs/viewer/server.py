@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import io
 import socket
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -14,28 +13,12 @@ import numpy as np
 
 from wildgs.errors import UserError
 from wildgs.files import printable
+from wildgs.viewer.config import LOCAL, ServerConfig
 
 if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
 
-LOCAL = "127.0.0.1"
 REMEDY = "the viewer needs viser: pip install 'wildgs[viewer]'"
-
-
-@dataclass(frozen=True)
-class ServerConfig:
-    """Where the viewer is reached.
-
-    Attributes:
-        host: Address to listen on: 127.0.0.1 for local access only, 0.0.0.0 for all interfaces. Whoever has the
-            address with its token sees the photos and can use this machine's processor.
-        port: Port to listen on; the next free one where it is taken.
-        share: Also open a public address through viser's relay.
-    """
-
-    host: str = LOCAL
-    port: int = 8080
-    share: bool = False
 
 
 def open_server(config: ServerConfig, title: str) -> GuardedServer:
