@@ -14,9 +14,9 @@ from jaxtyping import UInt8, UInt16
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_file
+from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.image_cache import ImageCache
 from wildgs.scene.images import (
-    MAX_IMAGE_PIXELS,
     Photo,
     ShapeMismatchError,
     UnreadableImageError,

@@ -134,15 +134,15 @@ def _described_points(
     features, descriptors = find_features(view.read_photo().numpy(), min(MAX_IMAGE_SIZE, detail))
     positions, depth = camera.project(points[observed])
     in_front = depth > 0
-    positions, observed = positions[in_front].double().numpy(), observed[in_front].numpy()
-    if len(features) == 0 or len(observed) == 0:
+    positions, owners = positions[in_front].double().numpy(), observed[in_front].numpy()
+    if len(features) == 0 or len(owners) == 0:
         return np.zeros((0, 128), np.uint8), np.zeros(0, np.int64)
     long_side = max(camera.width, camera.height)
     reach = max(SAME_PLACE * long_side, long_side / min(long_side, detail))
     found = KDTree(positions).query(features, distance_upper_bound=reach)
     distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     near = np.isfinite(distance)
-    return descriptors[near], observed[nearest[near]]
+    return descriptors[near], owners[nearest[near]]
 
 
 def find_features(
