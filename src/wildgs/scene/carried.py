@@ -93,13 +93,9 @@ def _write_photo(lights: Path, number: int, photo: Photo, side: int) -> None:
         small = image if size == image.size else image.resize(size, Image.Resampling.LANCZOS)
         small.save(aside, "JPEG", quality=QUALITY, subsampling=0)
     if photo.mask is not None:
-        mask = (
-            Image.fromarray(photo.mask)
-            .resize(size, Image.Resampling.BOX)
-            .point(lambda value: 255 * (value > 127))
-        )
+        mask = np.array(Image.fromarray(photo.mask).resize(size, Image.Resampling.BOX)) > 127
         with written_aside(_mask_file(lights, number)) as aside:
-            mask.convert("1").save(aside, "PNG")
+            Image.fromarray(mask).save(aside, "PNG")
 
 
 def _photo_file(lights: Path, number: int) -> Path:
