@@ -97,12 +97,12 @@ def test_every_picture_is_inside_the_page_with_its_own_pixels_and_says_what_it_s
     by_color = {str(a["alt"]): np.asarray(image)[-1, -1].tolist() for a, image in pictures}
     for alt, color in {
         "Photo a.jpg": (200, 30, 30),
-        "Render of a.jpg under its own light": (30, 200, 30),
+        "Render of a.jpg under its own appearance": (30, 200, 30),
         "Visibility mask of a.jpg": (255, 255, 255),
         "a.jpg without transients": (250, 250, 250),
         "a.jpg rendered by 3DGS": (10, 10, 10),
         "a.jpg rendered under the appearance of b.jpg": (120, 120, 9),
-        "Photo b.jpg, whose light it is": (9, 9, 200),
+        "Photo b.jpg, the source of the appearance": (9, 9, 200),
     }.items():
         np.testing.assert_allclose(by_color[alt], color, atol=4)
     assert len(pictures) == 8

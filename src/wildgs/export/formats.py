@@ -92,7 +92,7 @@ def _by_gsply(splats: Splats, kind: SplatFormat) -> bytes:
     """Converts through files, since gsply has no other interface for both formats."""
     gsply = _package("gsply", kind)
     spz = kind == "spz"
-    placed = splats.turned(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats
+    placed = splats.rotated(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats
     write: Callable[..., Any] = gsply.write_spz if spz else gsply.plywrite
     options: dict[str, Any] = {"fractional_bits": _spz_bits(placed)} if spz else {"compressed": True}
     with TemporaryDirectory() as folder:
