@@ -113,7 +113,7 @@ def total(done: list[tuple[bool, Tally]], on: bool) -> Tally:
 
 def trainer_of(folder: Path) -> tuple[Trainer, TrainingSubject]:
     run = load_run(folder)
-    scene = run.load_scene()
+    scene = run.read_scene()
     trainer = resume_training(folder, scene)
     longer = Trainer(trainer.method, scene, replace(trainer.config, steps=LONGER * max(trainer.step, 1)))
     longer.restore(trainer.state())
@@ -127,7 +127,7 @@ def main(command: Command) -> None:
     server = open_server(ServerConfig(port=0), "benchmark")
     viewer = Viewer(server, subject, ViewerConfig())
     protocol = f"viser-v{viser.__version__}"
-    address = f"ws://127.0.0.1:{server.get_port()}"
+    address = f"ws://127.0.0.1:{server.get_port()}/{server.access.token}"
     audience = subprocess.Popen([sys.executable, "-c", AUDIENCE, address, protocol])
     turns = TrainingTurns(viewer.jobs, lambda: audience.poll() is None, lambda _: viewer.ask_for_update())
     alternation = Alternation(turns, viewer, command)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.memory_views import make_view
 from wildgs.errors import UserError
 from wildgs.evaluation.lpips import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
@@ -64,16 +65,8 @@ def picture(seed: int) -> torch.Tensor:
 
 
 def view(name, split="test", photo=None, mask=None, clean=None, truth_mask=None) -> View:
-    return View(
-        name=name,
-        camera=camera(),
-        split=split,
-        read_photo=lambda: picture(0) if photo is None else photo,
-        read_mask=lambda: mask,
-        read_disparity=lambda: None,
-        read_clean=lambda: clean,
-        read_truth_mask=lambda: truth_mask,
-    )
+    photo = picture(0) if photo is None else photo
+    return make_view(name, camera(), split, photo, mask=mask, clean=clean, truth_mask=truth_mask)
 
 
 def scene(*views: View) -> Scene:
@@ -259,7 +252,7 @@ def test_renders_that_are_no_numbers_are_said_so(tmp_path):
         Painter(lambda p: torch.full((H, W, 3), torch.nan)), scene(view("a.jpg")), "full", tmp_path, step=1
     )
     assert math.isfinite(content["mean"]["psnr"])
-    assert any("no numbers" in note for note in content["notes"])
+    assert any("non-finite" in note for note in content["notes"])
 
 
 def test_training_mode_is_restored(tmp_path):
@@ -269,7 +262,7 @@ def test_training_mode_is_restored(tmp_path):
 
 
 def test_a_scene_without_test_photos_is_a_users_mistake(tmp_path):
-    with pytest.raises(UserError, match="holds out no photo"):
+    with pytest.raises(UserError, match="no test photos"):
         evaluate(Painter(lambda photo: photo), scene(view("a.jpg", "train")), "full", tmp_path, step=1)
 
 
@@ -300,4 +293,4 @@ def test_perceptual_distance_is_in_the_file_where_weights_are(tmp_path, shared):
         lpips_folder=folder,
     )
     assert small["mean"]["lpips"] is None
-    assert any("pixels a side" in note for note in small["notes"])
+    assert any("pixels per side" in note for note in small["notes"])

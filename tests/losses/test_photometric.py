@@ -4,7 +4,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.losses.evidence import color_evidence, structural_correlation, transient_evidence
+from wildgs.losses.evidence import (
+    FLAT,
+    PROOF,
+    color_evidence,
+    proven_static,
+    structural_correlation,
+    transient_evidence,
+)
 from wildgs.losses.photometric import masked_photometric
 from wildgs.losses.ssim import _ssim_by_convolution, gaussian_taps, ssim
 
@@ -234,8 +241,8 @@ def test_structural_correlation_is_the_windows_own():
         p[row - radius : row + radius + 1, column - radius : column + radius + 1].mean(dim=2).flatten()
         for p in (photo, render)
     )
-    covariance = ((x - x.mean()) * (y - y.mean())).mean() + 0.02**2
-    expected = covariance / ((x.var(correction=0) + 0.02**2) * (y.var(correction=0) + 0.02**2)).sqrt()
+    covariance = ((x - x.mean()) * (y - y.mean())).mean() + FLAT**2
+    expected = covariance / ((x.var(correction=0) + FLAT**2) * (y.var(correction=0) + FLAT**2)).sqrt()
     assert float(structural_correlation(photo, render)[row, column]) == pytest.approx(
         float(expected), abs=1e-4
     )
@@ -249,3 +256,27 @@ def test_hiding_a_wrong_region_lowers_the_loss():
     masked_photometric(photo, render, visibility).backward()
     assert visibility.grad[10:22, 10:22].mean() > 0
     assert visibility.grad[10:22, 10:22].mean() > 10 * visibility.grad[0:2].abs().mean()
+
+
+def test_cells_with_observations_are_proven_static():
+    observations = torch.tensor([[10.5, 3.0], [59.9, 39.9]])
+    proven = proven_static(observations, 40, 60)
+    assert bool(proven[3, 10])
+    assert bool(proven[39, 59])
+    assert int(proven.sum()) == 2, "60 pixels have cells of one"
+    assert int(proven_static(observations * 4, 160, 240).sum()) == 2 * 16
+    assert not proven_static(torch.zeros(0, 2), 40, 60).any()
+
+
+def test_proof_shows_what_evidence_would_hide_and_sky_is_never_hidden():
+    photo, _ = pictures(60, 60)
+    render = photo.clone()
+    render[20:40, 20:40] = 1 - render[20:40, 20:40]
+    visibility = torch.full((60, 60), 0.9, dtype=torch.float64, requires_grad=True)
+    proven, sky = torch.zeros(60, 60, dtype=torch.bool), torch.zeros(60, 60, dtype=torch.bool)
+    proven[20:40, 20:26], sky[20:40, 34:40] = True, True
+    masked_photometric(photo, render, visibility, proven=proven, sky=sky).backward()
+    gradient = visibility.grad[22:38]
+    assert bool((gradient[:, 20:26] == -PROOF / 3600).all())
+    assert float(gradient[:, 27:33].mean()) > 0.1 / 3600
+    assert bool((gradient[:, 34:40] == 0).all())

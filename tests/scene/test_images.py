@@ -1,3 +1,4 @@
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,12 @@ from PIL import Image
 from wildgs.scene.images import (
     ShapeMismatchError,
     UnreadableImageError,
+    open_image,
     read_disparity,
     read_mask,
     read_photo,
     same_shape,
+    upright_size,
 )
 
 W, H = 40, 24
@@ -30,6 +33,41 @@ ORIENTED = {
     7: lambda a: np.rot90(np.transpose(a, (1, 0, 2)), 2),
     8: lambda a: np.rot90(a, 1),
 }
+
+
+def exif_of(entries: list[tuple[int, int, int, bytes]]) -> bytes:
+    """An EXIF block, byte by byte: tag, type, count and four bytes of value."""
+    block = struct.pack("<2sHIH", b"II", 42, 8, len(entries))
+    block += b"".join(struct.pack("<HHI4s", *entry) for entry in entries)
+    return b"Exif\0\0" + block + struct.pack("<I", 0)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        (0x011A, 2, 4, b"72a\0"),  # XResolution as text
+        (0x0100, 8, 1, struct.pack("<hH", -5, 0)),  # ImageWidth as a signed short
+        (0x010F, 7, 4, b"\xff\xfe\0\x01"),  # Make as undefined bytes
+        (0x011A, 5, 1, b"\xff\xff\xff\xff"),  # a rational number beyond the end
+        (0x8769, 4, 1, b"\x08\0\0\0"),  # an EXIF block that contains itself
+    ],
+)
+def test_odd_exif_entries_do_not_matter(tmp_path: Path, entry: tuple[int, int, int, bytes]) -> None:
+    """Orientation 6 and one entry that Pillow can read, but not write again."""
+    path = tmp_path / "a.jpg"
+    oriented = (0x0112, 3, 1, struct.pack("<HH", 6, 0))
+    Image.fromarray(gradient()).save(path, exif=exif_of([entry, oriented]), quality=95)
+    expected = np.rot90(gradient(), -1).astype(float)
+    assert np.abs(read_photo(path).pixels - expected).mean() < 4
+
+
+def test_tiffs_are_turned_once(tmp_path: Path) -> None:
+    """Pillow turns them while it loads them."""
+    path = tmp_path / "a.tif"
+    Image.fromarray(gradient()).save(path, tiffinfo={0x0112: 6})
+    np.testing.assert_array_equal(read_photo(path).pixels, np.rot90(gradient(), -1))
+    with open_image(path) as image:
+        assert upright_size(image) == (H, W)
 
 
 def save_oriented(path: Path, orientation: int) -> Path:
@@ -69,7 +107,7 @@ def test_grey_is_spread_over_the_channels(tmp_path: Path) -> None:
     Image.fromarray(grey).save(tmp_path / "a.png")
     photo = read_photo(tmp_path / "a.png")
     assert np.array_equal(photo.pixels, np.repeat(grey[..., None], 3, axis=-1))
-    assert photo.opaque is None
+    assert photo.mask is None
 
 
 def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
@@ -104,9 +142,9 @@ def test_transparent_pixels_are_black_and_ignored(tmp_path: Path) -> None:
     alpha[:, 10:20] = 1
     Image.fromarray(np.dstack([gradient(), alpha])).save(tmp_path / "a.png")
     photo = read_photo(tmp_path / "a.png")
-    assert photo.opaque is not None
-    assert (photo.opaque[:, :10] == 0).all()
-    assert (photo.opaque[:, 10:] == 255).all()  # only what shows nothing at all is ignored
+    assert photo.mask is not None
+    assert (photo.mask[:, :10] == 0).all()
+    assert (photo.mask[:, 10:] == 255).all()  # only what shows nothing at all is ignored
     assert (photo.pixels[:, :10] == 0).all()
     assert np.array_equal(photo.pixels[:, 20:], gradient()[:, 20:])
 
@@ -118,8 +156,8 @@ def test_a_transparent_palette_colour_is_alpha(tmp_path: Path) -> None:
     image.putpalette([200, 10, 10, 10, 200, 10])
     image.save(tmp_path / "a.png", transparency=0)
     photo = read_photo(tmp_path / "a.png")
-    assert photo.opaque is not None
-    assert (photo.opaque[:, :20] == 0).all()
+    assert photo.mask is not None
+    assert (photo.mask[:, :20] == 0).all()
     assert tuple(photo.pixels[0, -1]) == (10, 200, 10)
 
 

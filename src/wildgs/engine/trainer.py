@@ -32,6 +32,7 @@ from wildgs.model.precision import (
 )
 from wildgs.scene import Scene, View, scene_extent
 from wildgs.scene.config import parse_bytes
+from wildgs.scene.scene import observed_pixels
 
 PREPARATION_PHOTOS = 16
 
@@ -107,7 +108,7 @@ class Trainer:
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
-        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device)
+        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
@@ -174,7 +175,7 @@ class Trainer:
         return StepReport(self.step, view, losses, output, count, density, self.seconds, fault, taken)
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
-        photo, keep = self.feed.photo(view), self.feed.keep(view)
+        photo, keep = self.feed.photo(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
@@ -188,6 +189,7 @@ class Trainer:
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
+            observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
         )
         return output, losses
@@ -220,7 +222,7 @@ class Trainer:
         sort_rows(self.method.gaussians, self.optimizers.rows)
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
-        self.method.prepare([self.feed.photo(view) for view in chosen])
+        self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to go on exactly, as flat tensors."""

@@ -15,11 +15,11 @@ from wildgs.model.squeezenet import LPIPS_TAPS, LPIPS_WIDTHS, packaged_weights, 
 
 Network = Literal["alex", "squeeze"]
 MIN_SIDE = 32
-"""Smallest side in pixels for which both backbones' deepest layer has an extent."""
+"""Smallest side in pixels for which the deepest layer of both backbones is not empty."""
 ENVIRONMENT = "WILDGS_LPIPS"
 """A folder with a backbone and its linear layers, or ``off`` for no LPIPS at all."""
 
-# LPIPS's own normalisation of inputs in -1..1.
+# Normalisation of inputs in [-1, 1], from LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _BACKBONE_NAMES: dict[Network, str] = {"alex": "alexnet*.pth", "squeeze": "squeezenet1_1*.pth"}
@@ -27,10 +27,10 @@ _TITLES: dict[Network, str] = {"alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
 
 
 class LPIPS(nn.Module):
-    """The learned perceptual distance of two pictures.
+    """Learned perceptual distance of two pictures.
 
-    Layers are compared after their ReLU, each with its channels normalised to unit length, squared, weighted by the
-    linear layer and averaged over the picture.
+    Features after each tapped ReLU are normalised to unit length over the channels; squared differences are
+    weighted by the linear layer and averaged over the picture.
     """
 
     shift: Tensor
@@ -49,14 +49,14 @@ class LPIPS(nn.Module):
         self.requires_grad_(False).eval()
 
     def load(self, backbone: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
-        """Takes weights in torchvision's and LPIPS's own layouts.
+        """Loads weights in the layouts of torchvision and LPIPS.
 
         Args:
-            backbone: torchvision's state dict, of the whole network or of its `features` alone.
-            linear: LPIPS's ``lin{i}.model.1.weight``, each [1, C, 1, 1].
+            backbone: State dict of torchvision, of the whole network or of its `features`.
+            linear: ``lin{i}.model.1.weight`` of LPIPS, each [1, C, 1, 1].
 
         Raises:
-            RuntimeError: Names or shapes do not fit.
+            RuntimeError: Names or shapes do not match.
         """
         prefix = "features."
         if any(name.startswith(prefix) for name in backbone):

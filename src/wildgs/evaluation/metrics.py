@@ -1,4 +1,4 @@
-"""Scores of a render against the truth, on pictures rounded to 8 bits."""
+"""Scores of renders (PSNR, SSIM) on pictures rounded to 8 bits, and of transient masks (AP, IoU)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from torch import Tensor
 
 from wildgs.losses.ssim import ssim_map
 
+_BINS = 1 << 16
 MAX_PSNR = 100.0
-"""What equal pictures score, in dB, so that means stay finite."""
+"""PSNR of equal pictures in dB, so that means stay finite."""
 
 
 def to_8bit(picture: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
-    """Clamp to 0..1 and round to 8 bits, as a picture file holds it; what is not a number becomes black."""
+    """Clamps to [0, 1] and rounds to 8 bits, as in an image file; NaN becomes black."""
     return (picture.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -22,15 +23,15 @@ def psnr(
     truth: UInt8[Tensor, "H W 3"],
     keep: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB, from the mean square error over all pixels and channels.
+    """Peak signal-to-noise ratio from the mean squared error over all pixels and channels.
 
     Args:
-        render: What is scored.
-        truth: What it should be.
+        render: Picture to score.
+        truth: Ground truth.
         keep: Pixels that count; None for all.
 
     Returns:
-        Decibels, at most `MAX_PSNR`.
+        PSNR in dB, at most `MAX_PSNR`.
     """
     square = ((render.double() - truth.double()) / 255).square()
     error = (square if keep is None else square[keep]).mean()
@@ -42,16 +43,68 @@ def structural_similarity(
     truth: UInt8[Tensor, "H W 3"],
     keep: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """SSIM as 3DGS and its descendants report it: Gaussian window of 11, sigma 1.5, data range 1.
+    """SSIM as 3DGS reports it: Gaussian window of 11, sigma 1.5, data range 1, double precision.
 
-    Windows at the border reach into zeros (3DGS's choice; others drop the border's 5 pixels instead), moments
-    are not corrected for the sample's size, and the map is averaged over pixels and channels. In double
-    precision.
+    Borders are padded with zeros as in 3DGS (other implementations crop 5 pixels instead), and moments are biased.
+    The map is averaged over pixels and channels.
 
     Args:
-        render: What is scored.
-        truth: What it should be.
+        render: Picture to score.
+        truth: Ground truth.
         keep: Pixels whose windows count; None for all.
     """
     similarity = ssim_map(render.double() / 255, truth.double() / 255)
     return float((similarity if keep is None else similarity[keep]).mean())
+
+
+class MaskScore:
+    """Scores predicted transient masks against the ground truth, pooled over the pixels of many photos.
+
+    Transient pixels are positives with score ``1 - M``. Scores are counted in 65,536 bins, so that memory does not
+    grow with the number of photos.
+    """
+
+    def __init__(self, threshold: float = 0.5) -> None:
+        """Args: threshold: Th; a pixel is predicted transient where ``M <= Th``, as in lifting."""
+        self.threshold = threshold
+        self.images = 0
+        self._counts = torch.zeros(2, _BINS, dtype=torch.float64)
+        self._both = 0
+        self._either = 0
+
+    def add(self, visibility: Float[Tensor, "H W"], static: Bool[Tensor, "H W"]) -> None:
+        """Adds one photo.
+
+        Args:
+            visibility: Predicted mask M, 1 = static.
+            static: Ground truth.
+        """
+        transient_score = (1 - visibility.detach().cpu().double()).clamp(0, 1)
+        bins = (transient_score * (_BINS - 1)).round().long().flatten()
+        truth = ~static.cpu().flatten()
+        for row, chosen in enumerate((~truth, truth)):
+            self._counts[row] += torch.bincount(bins[chosen], minlength=_BINS)
+        predicted = (visibility.detach() <= self.threshold).cpu().flatten()
+        self._both += int((predicted & truth).sum())
+        self._either += int((predicted | truth).sum())
+        self.images += 1
+
+    @property
+    def average_precision(self) -> float | None:
+        """Σ (R_n - R_{n-1}) P_n over all thresholds (as in scikit-learn); None without transients."""
+        negatives, positives = self._counts.flip(1).cumsum(1)
+        total = positives[-1]
+        if total == 0:
+            return None
+        precision = positives / (positives + negatives).clamp(min=1)
+        gained = torch.diff(positives, prepend=positives.new_zeros(1)) / total
+        return float((gained * precision).sum())
+
+    @property
+    def iou(self) -> float | None:
+        """Intersection over union of predicted and true transients; None if there are none."""
+        return self._both / self._either if self._either else None
+
+    def as_dict(self) -> dict[str, float | int | None]:
+        """Content of ``masks`` in `metrics.json`."""
+        return {"average_precision": self.average_precision, "iou": self.iou, "images": self.images}

@@ -7,7 +7,7 @@ Another light changes colours, by day and by dusk also their hue; it leaves edge
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -28,8 +28,14 @@ STRUCTURE_WINDOWS = 24
 """Windows along the long side in which structure is compared."""
 SAME_STRUCTURE = 0.7
 """Correlation from which on photo and render show the same thing, whatever their colours."""
-FLAT = 0.02
-"""Standard deviation of grey values below which a window counts as flat."""
+FLAT = 0.005
+"""Standard deviation of grey values below which a window counts as flat, about that of the rounding to 8 bits."""
+
+PROOF_CELLS = 60
+"""A triangulated point that the photo observes speaks for the cell in which it lies, of so many along the long
+side."""
+PROOF = 0.4
+"""Weight of the proof that a cell is static, in units of the image loss: λ^M's start."""
 
 
 @torch.no_grad()
@@ -110,3 +116,20 @@ def _box_mean(x: Float[Tensor, "B 1 H W"], radius: int) -> Float[Tensor, "B 1 H 
     side = 2 * radius + 1
     x = functional.avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
     return functional.avg_pool2d(x, (1, side), 1, (0, radius), count_include_pad=False)
+
+
+@torch.no_grad()
+def proven_static(observations: Float[Tensor, "K 2"], height: int, width: int) -> Bool[Tensor, "H W"]:
+    """Pixels in cells in which the photo observes a triangulated point: other photos show the same thing there.
+
+    Args:
+        observations: Pixels (x, y) of the points.
+        height: Of the photo.
+        width: Of the photo.
+    """
+    side = max(1, round(max(height, width) / PROOF_CELLS))
+    rows, columns = -(-height // side), -(-width // side)
+    cells = torch.zeros(rows, columns, dtype=torch.bool, device=observations.device)
+    x, y = (observations / side).long().unbind(1)
+    cells[y.clamp(0, rows - 1), x.clamp(0, columns - 1)] = True
+    return cells.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width]

@@ -27,7 +27,7 @@ SQUEEZENET_LEVELS = (4, 7, 9, 12)
 """Layers whose features are read, at 1/4, 1/8, 1/16 and 1/16 of the resolution."""
 SQUEEZENET_WIDTHS = (128, 256, 384, 512)
 LEAST_VARIANCE = 1e-4
-"""Of a feature over the collection: what hardly varies is not amplified."""
+"""Of a level over the collection: what hardly varies (blank photos) is not amplified further."""
 
 
 class FrozenBatchNorm(nn.Module):
@@ -120,7 +120,7 @@ class SqueezeNetEncoder(Encoder):
         self._layers = (layers.requires_grad_(False),)
         for level, width in enumerate(self.widths):
             self.register_buffer(f"center{level}", torch.zeros(width))
-            self.register_buffer(f"scale{level}", torch.ones(width))
+            self.register_buffer(f"scale{level}", torch.ones(()))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SqueezeNetEncoder:
         """Moves the weights to where the module is moved."""
@@ -138,10 +138,9 @@ class SqueezeNetEncoder(Encoder):
         return levels
 
     def standardize(self, raw: list[Tensor]) -> list[Tensor]:
-        """`raw` features with mean 0 and spread 1 over the collection."""
+        """`raw` features with mean 0 a channel and spread 1 a level over the collection."""
         return [
-            (x.float() - self.get_buffer(f"center{level}")[:, None, None])
-            * self.get_buffer(f"scale{level}")[:, None, None]
+            (x.float() - self.get_buffer(f"center{level}")[:, None, None]) * self.get_buffer(f"scale{level}")
             for level, x in enumerate(raw)
         ]
 
@@ -151,11 +150,15 @@ class SqueezeNetEncoder(Encoder):
 
     @torch.no_grad()
     def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
-        """Takes mean and spread of every channel from photos of the collection."""
+        """Takes the mean of every channel and the spread of every level from photos of the collection.
+
+        One spread for all channels of a level: a channel that hardly varies says little, and amplified it would let
+        the embedding learn single photos by heart.
+        """
         for level, x in enumerate(self.raw(images)):
             variance, mean = torch.var_mean(x.float(), dim=(0, 2, 3), correction=0)
             self.get_buffer(f"center{level}").copy_(mean)
-            self.get_buffer(f"scale{level}").copy_(variance.clamp_min(LEAST_VARIANCE).rsqrt())
+            self.get_buffer(f"scale{level}").copy_(variance.mean().clamp_min(LEAST_VARIANCE).rsqrt())
 
 
 class ResNetEncoder(Encoder):
