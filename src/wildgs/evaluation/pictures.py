@@ -46,9 +46,12 @@ def _inside(name: str) -> PurePosixPath:
 
 
 def write_picture(file: Path, picture: UInt8[Tensor, "H W 3"]) -> None:
-    """Write a PNG; a run cut short leaves no half picture under its name."""
+    """Writes a PNG, or a JPEG where the name asks for one; a run cut short leaves no half picture."""
+    options = (
+        {"format": "JPEG", "quality": 95} if file.suffix.lower() in (".jpg", ".jpeg") else {"format": "PNG"}
+    )
     with written_aside(file) as aside:
-        Image.fromarray(picture.cpu().numpy()).save(aside, format="PNG")
+        Image.fromarray(picture.cpu().numpy()).save(aside, **options)
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:

@@ -18,9 +18,10 @@ from torch import Tensor
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
 from wildgs.light.look import Look
-from wildgs.light.sources import LightSources, Progress
+from wildgs.light.sources import LightSources
 from wildgs.light.timeline import Timeline
 from wildgs.model.gaussians import Gaussians
+from wildgs.progress import Progress
 from wildgs.rasterize import blend, sh_to_colors
 from wildgs.runs import Run, load_run
 from wildgs.scene import Scene, View

@@ -8,34 +8,20 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import yaml
 
 from wildgs.config import RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
-from wildgs.model.wildgs import WildGSConfig
+from wildgs.library.config import METHODS, BenchMethod
+from wildgs.model.config import WildGSConfig
 from wildgs.presets import with_preset
 from wildgs.runs import CONFIG_FILE
 from wildgs.scene.colmap import find_model
 from wildgs.scene.split import find_split_file
 
-BenchMethod = Literal[
-    "3dgs",
-    "wildgs-half-steps",
-    "wildgs",
-    "paper",
-    "fast",
-    "without-crop",
-    "without-reverse",
-    "without-global",
-    "without-mask",
-    "without-depth",
-    "without-intrinsic",
-    "without-local",
-]
-METHODS: tuple[BenchMethod, ...] = get_args(BenchMethod)
 LABELS: dict[str, str] = {
     "3dgs": "3DGS",
     "wildgs-half-steps": "Wild-GS†",
@@ -141,7 +127,7 @@ def find_phototourism(places: Sequence[Path]) -> tuple[Path, ...]:
     missing = ", ".join(name for name in PHOTOTOURISM if name not in found)
     places_named = ", ".join(map(str, places))
     if not scenes:
-        raise UserError(f"{places_named}: none of the preset's scenes ({missing}) is there")
+        raise UserError(f"{places_named}: none of the suite's scenes ({missing}) is there")
     if missing:
         warnings.warn(f"{places_named}: no {missing}; the table goes without", WildGSWarning, stacklevel=2)
     for scene in scenes:
@@ -220,7 +206,6 @@ def _check_stored(job: Job) -> None:
     if not file.is_file():
         return
     differing = differing_entries(read_config(file), job.config)
-    differing.pop("data.image_cache", None)  # it has no influence on the result
     budget = differing.get("train.density.max_gaussians")
     if budget is not None and budget[0] < budget[1]:  # lowered where memory was short
         del differing["train.density.max_gaussians"]

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from wildgs.evaluation.metrics import to_8bit
-from wildgs.evaluation.protocol import Protocol
 from wildgs.export.report import MethodScores, Report, ReportExample, write_report
 from wildgs.geometry.tour import spread_out
+from wildgs.library.evaluation import Scores
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import Run
@@ -21,8 +20,6 @@ from wildgs.scene import Scene, View
 
 EXAMPLES = 4
 LIGHTS = 3
-
-Scores = dict[Protocol, dict[str, Any]]
 
 
 def write_showcase(

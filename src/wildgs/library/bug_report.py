@@ -10,7 +10,7 @@ import socket
 from collections.abc import Sequence
 from pathlib import Path
 
-from wildgs.cli.logs import LOG_FILE
+from wildgs.library.logs import LOG_FILE
 from wildgs.runs import CONFIG_FILE
 
 PACKAGES = (

@@ -1,8 +1,9 @@
-"""Ctrl-C and the end of a cluster's time slot: the first finishes the step and saves, the second stops at once."""
+"""Signals that end a training: the first finishes the step and saves, the second stops at once."""
 
 from __future__ import annotations
 
-import os
+import contextlib
+import logging
 import signal
 import threading
 from types import FrameType, TracebackType
@@ -11,7 +12,10 @@ from typing import Any
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import StepReport
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Ctrl-C, the end of a cluster's time slot, and a terminal that was closed."""
+
+logger = logging.getLogger("wildgs")
 
 
 class InterruptedTrainingError(KeyboardInterrupt):
@@ -41,8 +45,9 @@ class StopOnSignal:
 
     def __enter__(self) -> StopOnSignal:
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
-            for number in _SIGNALS:
-                self._previous[number] = signal.signal(number, self._receive)
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+                    self._previous[number] = signal.signal(number, self._receive)
         return self
 
     def __exit__(
@@ -56,10 +61,12 @@ class StopOnSignal:
 
     def _receive(self, number: int, _: FrameType | None) -> None:
         if self.received is not None:
+            if number == getattr(signal, "SIGHUP", None):
+                return  # a closed terminal sends it to every process of a group, more than once
             raise KeyboardInterrupt
         self.received = self.team.wish = number
-        # Not print(): the signal may have come in the middle of one.
-        os.write(2, b"\nstopping after this step, then saving; once more stops at once, unsaved\n")
+        with contextlib.suppress(OSError, RuntimeError):  # the signal may have come in the middle of a write
+            logger.info("stopping after this step, then saving; a second signal stops at once, unsaved")
 
     def __call__(self, report: StepReport) -> None:
         """Ends training if a signal has come.

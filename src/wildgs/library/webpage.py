@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wildgs.api import LoadedScene
-from wildgs.cli.lights import find_look
-from wildgs.cli.showcase import different_lights
 from wildgs.export.cleanup import CleanupConfig, kept_rows
 from wildgs.export.page import Page, PageLight, PageView, write_page
 from wildgs.export.splats import Splats
 from wildgs.export.start_view import choose_start
+from wildgs.library.loaded import LoadedScene
+from wildgs.library.looks import find_looks
+from wildgs.library.showcase import different_lights
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.model.gaussians import NEAR
+from wildgs.progress import Progress
 from wildgs.runs import Run
 from wildgs.scene import View, match_view
 
@@ -84,18 +85,19 @@ def write_webpage(
     return WrittenPage(file, file.stat().st_size / 1e6, degree, len(page.splats))
 
 
-def write_scene_page(run: Run, file: Path, title: str) -> WrittenPage:
+def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> WrittenPage:
     """Writes the page of a run under lights chosen for it; ends `wildgs run` and `wildgs demo`."""
     loaded = LoadedScene(run)
-    return write_webpage(loaded, page_looks(loaded), file, title=title)
+    return write_webpage(loaded, page_looks(loaded, progress), file, title=title)
 
 
-def page_looks(loaded: LoadedScene) -> list[Look]:
+def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Look]:
     """The light of a few photos as unlike each other as the scene has them; the one look of plain 3DGS."""
     if not loaded.relightable:
         return [loaded.appearance(NEUTRAL)]
     views = loaded.scene.train_views or loaded.views
-    return [find_look(loaded, view.name) for view in different_lights(views, PAGE_LIGHTS)]
+    chosen = different_lights(views, PAGE_LIGHTS)
+    return find_looks(loaded, [view.name for view in chosen], progress=progress)
 
 
 def baked(loaded: LoadedScene, look: Look) -> Splats:
