@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs import api
+import wildgs as api
 
 
 def _names(run: Path) -> list[str]:

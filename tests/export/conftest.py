@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from wildgs.export.splats import Splats
+from wildgs.exporters.splats import Splats
 
 CHROMIUM_FLAGS = [
     "--no-sandbox",

@@ -13,9 +13,8 @@ import pytest
 import torch
 
 from wildgs.errors import UserError
-from wildgs.export.formats import write_splats
-from wildgs.export.ply import ply_bytes
-from wildgs.export.splats import Splats
+from wildgs.exporters.formats import ply_bytes, write_splats
+from wildgs.exporters.splats import Splats
 
 gaussforge = pytest.importorskip("gaussforge")
 gsply = pytest.importorskip("gsply")

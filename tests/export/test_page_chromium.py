@@ -13,8 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
-from wildgs.export.page import Page, PageLight, PageView, write_page
-from wildgs.export.splats import Splats
+from wildgs.exporters.page import Page, PageLight, PageView, write_page
+from wildgs.exporters.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize import rasterize
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs.export.page_scene import PackedScene, pack_scene
-from wildgs.export.splats import Splats
+from wildgs.exporters.page_scene import PackedScene, pack_scene
+from wildgs.exporters.splats import Splats
 
 
 def _planes(packed: PackedScene) -> dict[str, np.ndarray]:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wildgs.export.depth_colors import color_depth
-from wildgs.export.report import MethodScores, Report, ReportExample, write_report
+from wildgs.exporters.depth_colors import color_depth
+from wildgs.exporters.report import MethodScores, Report, ReportExample, write_report
 
 HOSTILE = """<script>alert("x")</script>'"&.jpg"""
 REASON = "LPIPS is null: its weights are not at hand"

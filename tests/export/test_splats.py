@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from wildgs.export.splats import Splats
+from wildgs.exporters.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.rasterize import rasterize

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from wildgs.errors import UserError
-from wildgs.export.video import check_output, write_frames
+from wildgs.exporters.video import check_output, write_frames
 
 # imageio-ffmpeg leaves its pipes to the garbage collector, which is heard of in whatever test it comes to.
 pytestmark = pytest.mark.filterwarnings(

@@ -10,7 +10,7 @@ import tyro
 
 from wildgs.cli.options import UNNAMED, Mix
 from wildgs.cli.screen import console, print_notes, progress_shown
-from wildgs.export.config import CleanupConfig
+from wildgs.exporters.config import CleanupConfig
 from wildgs.library.config import ExportFormat, MixOptions
 
 

@@ -36,7 +36,7 @@ REFRESH_STEPS = 10
 class Forgiving:
     """Standard output or error, from which nobody may be reading: what cannot be shown is dropped.
 
-    A full disk under a redirection, a pipe whose reader left and a terminal that was closed must not end a training.
+    A full disk under a redirection, a pipe without a reader and a closed terminal must not end a training.
     """
 
     def __init__(self, name: str) -> None:

@@ -137,11 +137,11 @@ def _refuse_changes(command: Command, config: RunConfig) -> None:
     differing = differing_entries(read_config(command.output / CONFIG_FILE), config)
     differing.pop(BUDGET, None)
     if differing:
-        named = ", ".join(
+        changes = ", ".join(
             f"{option_name(path)} {new} (the run has {old})" for path, (old, new) in differing.items()
         )
         raise UserError(
-            f"--resume continues {command.output} with its own configuration, and cannot change {named}; leave "
+            f"--resume continues {command.output} with its own configuration and cannot change {changes}; leave "
             "these options out, or train anew into another --output"
         )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import tyro
 
 from wildgs.cli.screen import console
+from wildgs.files import printable
 from wildgs.viewer.config import ServerConfig, ViewerConfig
 
 
@@ -34,7 +35,7 @@ def run(command: Command) -> None:
         command.run, appearance=command.appearance, server=command.server, viewer=command.viewer
     )
     for url in opened.urls:
-        console.print(f"{command.run}: {url}")
+        console.print(f"{printable(str(command.run))}: {url}")
     console.print("Ctrl-C ends the viewer")
     opened.stay()
     console.print("closed")

@@ -80,17 +80,18 @@ class Autosave:
         Raises:
             UserError: It could not be written to the run folder; the message says where the state is.
         """
-        for left in reversed(range(1 if hurry else LAST_TRIES)):
+        left = 0 if hurry else LAST_TRIES - 1
+        while True:
             try:
-                self.save(step)
-                return
+                return self.save(step)
             except UserError as error:
                 failure = error
-            if left:
-                warnings.warn(
-                    f"{failure} (trying again for {left * LAST_WAIT:.0f} s)", WildGSWarning, stacklevel=2
-                )
-                time.sleep(LAST_WAIT)
+            if not left:
+                break
+            wait = f"{left * LAST_WAIT:.0f} s"
+            warnings.warn(f"{failure} (trying again for {wait})", WildGSWarning, stacklevel=2)
+            time.sleep(LAST_WAIT)
+            left -= 1
         if self._rescue is None:
             raise failure
         try:

@@ -222,7 +222,7 @@ class _Bench:
         return scene
 
     def _score(self, job: Job, scene: Scene) -> None:
-        missing = [protocol for protocol in PROTOCOLS if not self._is_scored(job, protocol)]
+        missing: list[Protocol] = [protocol for protocol in PROTOCOLS if not self._is_scored(job, protocol)]
         if missing:
             loaded = load_run(job.folder)
             evaluate(loaded, missing, scene=scene, lpips=self.request.lpips, progress=self.request.progress)

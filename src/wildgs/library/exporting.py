@@ -8,10 +8,10 @@ from pathlib import Path
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
-from wildgs.export.cleanup import agreement, clean
-from wildgs.export.config import CleanupConfig
-from wildgs.export.formats import SplatFormat, write_splats
-from wildgs.export.splats import Splats
+from wildgs.exporters.cleanup import agreement, clean
+from wildgs.exporters.config import CleanupConfig
+from wildgs.exporters.formats import SplatFormat, write_splats
+from wildgs.exporters.splats import Splats
 from wildgs.library.config import ExportFormat, MixOptions
 from wildgs.library.loaded import LoadedScene
 from wildgs.library.logs import logger

@@ -11,7 +11,7 @@ from PIL import Image
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
-from wildgs.export.sheet import contact_sheet
+from wildgs.exporters.sheet import contact_sheet
 from wildgs.files import written_aside
 from wildgs.library.config import MixOptions
 from wildgs.library.loaded import LoadedScene

@@ -122,8 +122,8 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
     changes = compare_collection(photos, scene)
     if changes:
         raise UserError(
-            f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or delete "
-            f"{scene.parent} to start again with these photos"
+            f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or "
+            f"delete {scene.parent} to start again with these photos"
         )
     logger.info("%s has poses of these photos already; going on with them", scene)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
-from wildgs.export.video import check_output, is_video, write_frames
+from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.trajectory import still
 from wildgs.library.config import MixOptions, TrajectoryOptions

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from wildgs.evaluation.metrics import to_8bit
-from wildgs.export.report import MethodScores, Report, ReportExample, write_report
+from wildgs.exporters.report import MethodScores, Report, ReportExample, write_report
 from wildgs.geometry.tour import spread_out
 from wildgs.library.evaluation import Scores
 from wildgs.light.photos import encode_view

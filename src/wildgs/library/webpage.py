@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wildgs.export.cleanup import CleanupConfig, kept_rows
-from wildgs.export.page import Page, PageLight, PageView, write_page
-from wildgs.export.splats import Splats
-from wildgs.export.start_view import choose_start
+from wildgs.exporters.cleanup import CleanupConfig, kept_rows
+from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
+from wildgs.exporters.splats import Splats
 from wildgs.library.loaded import LoadedScene
 from wildgs.library.looks import find_looks
 from wildgs.library.showcase import different_lights

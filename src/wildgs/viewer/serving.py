@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError
@@ -14,10 +14,13 @@ from wildgs.library.loaded import LoadedScene, load
 from wildgs.scene import Scene
 from wildgs.viewer.config import ServerConfig, ViewerConfig
 from wildgs.viewer.jobs import start_worker
-from wildgs.viewer.server import address, open_server
+from wildgs.viewer.server import address, open_server, public_address
 from wildgs.viewer.subject import Subject, TrainingSubject
 from wildgs.viewer.training import TrainingTurns
 from wildgs.viewer.viewer import Viewer
+
+if TYPE_CHECKING:
+    from wildgs.viewer.guarded import GuardedServer
 
 VIDEO_FOLDER = "videos"
 
@@ -94,9 +97,10 @@ def view(
     return OpenViewer(page, addresses(opened, config))
 
 
-def addresses(server: Any, config: ServerConfig) -> list[str]:
-    """What to type into a browser."""
-    return [address(server, config)]
+def addresses(server: GuardedServer, config: ServerConfig) -> list[str]:
+    """What to type into a browser: on this machine, and anywhere where the page is shared."""
+    found = (address(server, config), public_address(server, config))
+    return [url for url in found if url is not None]
 
 
 class TrainingWindow:

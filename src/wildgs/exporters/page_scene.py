@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from wildgs.export.splats import Splats
+from wildgs.exporters.splats import Splats
 from wildgs.geometry.morton import morton_order
 
 _TAIL = 2e-4

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from wildgs.export.depth_colors import color_depth
-from wildgs.export.report_scores import MethodScores, scores_section
+from wildgs.exporters.depth_colors import color_depth
+from wildgs.exporters.report_scores import MethodScores, scores_section
 from wildgs.files import written_aside
 
 __all__ = ["MethodScores", "Report", "ReportExample", "write_report"]
@@ -77,7 +77,7 @@ def write_report(report: Report, file: Path) -> None:
         report: What to show.
         file: The HTML file; its folder is made where it is missing.
     """
-    template = files("wildgs.export").joinpath("report_template.html").read_text(encoding="utf-8")
+    template = files("wildgs.exporters").joinpath("report_template.html").read_text(encoding="utf-8")
     page = Template(template).substitute(
         title=escape(report.title),
         summary=escape(report.summary),
