@@ -3,9 +3,9 @@ from pathlib import Path
 import pytest
 
 from wildgs.cli import depth, sfm
+from wildgs.cli import main as wildgs
 from wildgs.library import pipeline
 from wildgs.sfm import reconstruction
-from wildgs.cli import main as wildgs
 from wildgs.sfm.report import SfmReport
 
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -48,7 +48,7 @@ class Forgiving:
         self._name = name
 
     @property
-    def _stream(self) -> TextIO:
+    def _stream(self) -> Any:
         return getattr(sys, self._name)
 
     def write(self, text: str) -> int:
