@@ -18,7 +18,7 @@ from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.model.config import MethodName, WildGSConfig
-from wildgs.scene.config import DataConfig, parse_bytes
+from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
 MAX_CONFIG_BYTES = 1_000_000
 
@@ -41,7 +41,7 @@ class ExecutionConfig:
         threads: CPU threads of kernels and torch; by default WILDGS_NUM_THREADS, or all cores.
     """
 
-    image_cache: str = "4GB"
+    image_cache: str = IMAGE_CACHE
     checkpoint_every: int = 1000
     checkpoint_minutes: float = 10.0
     log_every: int = 50

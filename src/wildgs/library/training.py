@@ -154,7 +154,8 @@ def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunCon
 
 def read_scene(config: RunConfig, execution: ExecutionConfig, progress: Progress | None = None) -> Scene:
     """Reads the scene of a configuration, and logs what is in it."""
-    scene = load_scene(config.scene, config.data, progress=counter(progress, "reading photos"))
+    show = counter(progress, "reading photos")
+    scene = load_scene(config.scene, config.data, image_cache=execution.image_cache, progress=show)
     logger.info(
         "%s: %d photos train, %d test, %s points",
         scene.root,

@@ -15,7 +15,7 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
-from wildgs.scene.config import DataConfig, parse_bytes
+from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 from wildgs.scene.image_cache import DECODERS, CachedPictures, ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.pictures import PhotoFiles, Pictures
@@ -35,6 +35,7 @@ def load_scene(
     config: DataConfig | None = None,
     *,
     lazy: bool = False,
+    image_cache: str = IMAGE_CACHE,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Read a COLMAP scene: cameras, points, split, photos (8 bits, within `image_cache`), masks, depth.
@@ -47,6 +48,7 @@ def load_scene(
         config: Size, split and limits; the defaults where None.
         lazy: Decode photos only when they are asked for, and keep the last few: for tools that look at some of
             them. A photo that cannot be read is then no reason to leave its view out.
+        image_cache: Memory for decoded photos, such as 4GB; without influence on what is read.
         progress: Called with (photos read, photos in all) as photos are decoded.
 
     Returns:
@@ -66,7 +68,7 @@ def load_scene(
     )
     chosen = [image for image in model.images if image.name in splits]
     load_view = partial(
-        _lazy_view if lazy else partial(_load_view, cache=ImageCache(_cache_limit(config))),
+        _lazy_view if lazy else partial(_load_view, cache=ImageCache(_cache_limit(image_cache))),
         alignment=alignment,
         images_dir=model.images_dir,
         root=root,
@@ -118,8 +120,8 @@ def _load_views(
     return views, broken
 
 
-def _cache_limit(config: DataConfig) -> int:
-    limit, available = parse_bytes(config.image_cache), available_memory()
+def _cache_limit(image_cache: str) -> int:
+    limit, available = parse_bytes(image_cache), available_memory()
     return limit if available is None else min(limit, int(CACHE_SHARE * available))
 
 
