@@ -71,7 +71,7 @@ def read_run_scene(run: Run, root: str | Path | None = None, progress: Progress 
     Raises:
         UserError: The scene cannot be read, or is another one.
     """
-    return run.load_scene(counter(progress, "reading photos"))
+    return run.read_scene(None if root is None else Path(root), counter(progress, "reading photos"))
 
 
 def opened(run: str | Path | Run | LoadedScene) -> Run:

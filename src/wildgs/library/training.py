@@ -226,7 +226,14 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
     """
     trainer: Trainer | None = None
     try:
-        trainer = prepare_training(job.folder, config, job.scene, resume=resume, team=job.team)
+        trainer = prepare_training(
+            job.folder,
+            config,
+            job.scene,
+            resume=resume,
+            team=job.team,
+            progress=counter(job.progress, "copying photos to the run"),
+        )
         trainer.cuda_graphs = job.execution.cuda_graphs
         with ExitStack() as stack:
             if job.team.first:
