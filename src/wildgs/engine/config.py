@@ -8,7 +8,6 @@ from typing import Literal
 from wildgs.errors import UserError
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.model.config import Precision
-from wildgs.scene.config import parse_bytes
 
 
 @dataclass(frozen=True)
@@ -106,9 +105,6 @@ class TrainConfig:
         steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
         seed: Of everything random.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
-        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
-        feature_cache: Memory for the frozen encoder's features of training photos; those of further photos are
-            computed again at their turn. No influence on the result.
         objective: Loss weights.
         schedule: What happens when.
         optimizer: Learning rates.
@@ -118,8 +114,6 @@ class TrainConfig:
     steps: int = 30_000
     seed: int = 0
     precision: Precision = "auto"
-    cuda_graphs: bool = True
-    feature_cache: str = "1GB"
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -129,4 +123,3 @@ class TrainConfig:
         """Refuses a run without a step."""
         if self.steps < 1:
             raise UserError(f"steps {self.steps}: must be 1 or more")
-        parse_bytes(self.feature_cache)

@@ -31,10 +31,10 @@ from wildgs.model.precision import (
     switch_replays,
 )
 from wildgs.scene import Scene, View, scene_extent
-from wildgs.scene.config import parse_bytes
 from wildgs.scene.scene import observed_pixels
 
 PREPARATION_PHOTOS = 16
+FEATURE_CACHE_BYTES = 10**9
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,12 @@ Observer = Callable[[StepReport], None]
 
 
 class Trainer:
-    """Trains a method on a scene's training photos."""
+    """Trains a method on a scene's training photos.
+
+    Attributes:
+        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+        feature_cache: Bytes for the features that a frozen encoder gave of training photos.
+    """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
         """Sets up a `Trainer`.
@@ -110,6 +115,8 @@ class Trainer:
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
+        self.cuda_graphs = True
+        self.feature_cache = FEATURE_CACHE_BYTES
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -144,8 +151,8 @@ class Trainer:
         self.team.share(self.method.state_dict().values())
         self._verify()
         set_precision(self.method, precision)
-        switch_replays(self.method, self.config.cuda_graphs)
-        keep_features(self.method, FeatureCache(parse_bytes(self.config.feature_cache)))
+        switch_replays(self.method, self.cuda_graphs)
+        keep_features(self.method, FeatureCache(self.feature_cache))
 
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""
