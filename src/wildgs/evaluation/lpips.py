@@ -76,7 +76,7 @@ class LPIPS(nn.Module):
             ValueError: A side is shorter than `MIN_SIDE` pixels.
         """
         if min(first.shape[:2]) < MIN_SIDE:
-            raise ValueError(f"LPIPS needs at least {MIN_SIDE} pixels a side")
+            raise ValueError(f"LPIPS needs at least {MIN_SIDE} pixels per side")
         pair = torch.stack([first, second]).permute(0, 3, 1, 2).to(self.scale) / 127.5 - 1
         x = (pair - self.shift) / self.scale
         distance = x.new_zeros(())
@@ -123,7 +123,7 @@ def _load_from(folder: Path) -> tuple[LPIPS | None, str]:
         Exception
     ) as error:  # unpickling raises errors of many kinds; scores without LPIPS beat none at all
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        return None, f"LPIPS is null: {backbone} or {linear} cannot be used ({reason})"
+        return None, f"LPIPS is null: {backbone} or {linear} cannot load ({reason})"
     return model, _title(model)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -193,7 +193,17 @@ class ResNetEncoder(Encoder):
             norm.calibrating = False
 
 
-def load_encoder(source: str | None = SQUEEZENET, *, pretrained: bool = True) -> Encoder:
+def encoder_of(state: Mapping[str, Tensor], prefix: str) -> Encoder:
+    """An encoder of the kind that a checkpoint holds, whose tensors are still to be loaded.
+
+    Args:
+        state: The checkpoint's tensors.
+        prefix: Of the names of the encoder's tensors.
+    """
+    return SqueezeNetEncoder() if f"{prefix}center0" in state else load_encoder(None)
+
+
+def load_encoder(source: str | None = SQUEEZENET) -> Encoder:
     """The frozen SqueezeNet, or a ResNet-18 from a folder, the Hugging Face cache or the hub, in this order.
 
     Where a ResNet-18's weights cannot be found, one `WildGSWarning` says so, and it starts from random weights.
@@ -201,7 +211,6 @@ def load_encoder(source: str | None = SQUEEZENET, *, pretrained: bool = True) ->
     Args:
         source: `SQUEEZENET`; else a ResNet-18: a folder in the hub's layout, a hub name, or None for random weights
             without a warning.
-        pretrained: False skips looking for weights that a checkpoint will replace.
 
     Raises:
         UserError: `source` is an existing folder that does not hold a ResNet-18.
@@ -210,7 +219,7 @@ def load_encoder(source: str | None = SQUEEZENET, *, pretrained: bool = True) ->
         return SqueezeNetEncoder()
     from transformers import ResNetConfig, ResNetModel
 
-    if source is not None and pretrained:
+    if source is not None:
         resnet = _pretrained_resnet(source)
         if resnet is not None:
             return ResNetEncoder(resnet, pretrained=True)
