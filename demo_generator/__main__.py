@@ -1,4 +1,4 @@
-"""`python -m demo_generator`: renders the scene that ships with the package, or checks that it can be reproduced."""
+"""`python -m demo_generator`: renders the scene that ships with the package, or checks the one that does."""
 
 from __future__ import annotations
 
