@@ -112,7 +112,7 @@ def _load_from(folder: Path) -> tuple[LPIPS | None, str]:
     found = _find_in(folder)
     if found is None:
         return None, (
-            f"LPIPS is null: {folder} holds no backbone (alexnet*.pth or squeezenet1_1*.pth) "
+            f"LPIPS is null: {folder} contains no backbone (alexnet*.pth or squeezenet1_1*.pth) "
             "with linear layers (linear.pth, alex.pth or squeeze.pth)"
         )
     network, backbone, linear = found
@@ -123,7 +123,7 @@ def _load_from(folder: Path) -> tuple[LPIPS | None, str]:
         Exception
     ) as error:  # unpickling raises errors of many kinds; scores without LPIPS beat none at all
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        return None, f"LPIPS is null: {backbone} or {linear} cannot load ({reason})"
+        return None, f"LPIPS is null: cannot load {backbone} or {linear} ({reason})"
     return model, _title(model)
 
 
