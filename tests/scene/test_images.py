@@ -42,6 +42,7 @@ def exif_of(entries: list[tuple[int, int, int, bytes]]) -> bytes:
     return b"Exif\0\0" + block + struct.pack("<I", 0)
 
 
+@pytest.mark.filterwarnings("ignore:.*EXIF", "ignore:Truncated File Read")
 @pytest.mark.parametrize(
     "entry",
     [

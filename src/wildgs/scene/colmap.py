@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -95,12 +96,8 @@ def read_model(root: Path) -> ColmapModel:
         UserError: The model is missing, cannot be read, holds no photo with a pose or no point.
     """
     folder, images_dir = find_model(root)
-    binary = all((folder / name).is_file() for name in MODEL_FILES[0])
-    try:
-        records = read_binary(folder) if binary else read_text(folder)
-    except (ModelFileError, OSError, MemoryError) as error:
-        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
-    registered = _usable(records, folder)
+    records = read_records(folder)
+    registered = usable_images(records, folder)
     with np.errstate(invalid="ignore"):
         finite = np.all(np.abs(records.points.xyz) < MAX_COORDINATE, axis=1)
     if not finite.any():
@@ -123,8 +120,29 @@ def read_model(root: Path) -> ColmapModel:
     return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors))
 
 
-def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
-    """Photos with a camera and a pose that mean something, by name; the others are named in a warning."""
+def read_records(folder: Path, *, observations: bool = False) -> ModelRecords:
+    """The files of a model, binary where there are both kinds.
+
+    Args:
+        folder: Of the model.
+        observations: Whether to keep where photos show points.
+
+    Raises:
+        UserError: A file cannot be read.
+    """
+    binary = all((folder / name).is_file() for name in MODEL_FILES[0])
+    try:
+        return (read_binary if binary else read_text)(folder, observations=observations)
+    except (ModelFileError, OSError, MemoryError) as error:
+        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
+
+
+def usable_images(records: ModelRecords, folder: Path) -> list[ImageRecord]:
+    """Photos with a valid camera and pose, by name; the others are named in a warning.
+
+    Raises:
+        UserError: There is none, or two have the same id.
+    """
     images = sorted(records.images, key=lambda image: image.name)
     if not images:
         raise UserError(
@@ -169,7 +187,8 @@ def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
 def _checked_name(name: str, folder: Path) -> str:
     """A photo's name that stays within the image folder: other files are found, and written, by it."""
     path = PurePosixPath(name.replace("\\", "/"))
-    outside = path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0])
+    outside = path.is_absolute() or ".." in path.parts or PureWindowsPath(name).drive
+    outside = outside or (os.name == "nt" and ":" in name)
     if outside or not path.name or any(character < " " for character in name):
         raise UserError(
             f"{folder}: the photo {name!r} lies outside the image folder; give it a name within it"

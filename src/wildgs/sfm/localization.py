@@ -23,7 +23,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.scene.images import UnreadableImageError, open_image, read_photo
 from wildgs.scene.scene import Alignment
 from wildgs.scene.undistort import PixelGrid, sample_colors
-from wildgs.sfm.feature_index import MAX_IMAGE_SIZE, FeatureIndex, match_features
+from wildgs.sfm.feature_index import FeatureIndex, match_features, sift_features
 from wildgs.sfm.mapping import quiet
 from wildgs.sfm.upright import save_jpeg
 
@@ -81,13 +81,13 @@ class LocalizedPhoto:
 
 
 def localize(
-    file: Path, landmarks: FeatureIndex, alignment: Alignment, long_side: int, *, seed: int = 0
+    file: Path, index: FeatureIndex, alignment: Alignment, long_side: int, *, seed: int = 0
 ) -> LocalizedPhoto:
     """Finds the camera of a photo of the place.
 
     Args:
         file: The photo; any size, upright or with an EXIF orientation.
-        landmarks: Of the scene.
+        index: Of the scene.
         alignment: From the model's frame to the scene's aligned one.
         long_side: Pixels to which the photo is shrunk for use.
         seed: Of RANSAC.
@@ -101,11 +101,12 @@ def localize(
     except UnreadableImageError as error:
         raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
     camera, known = guess_camera(file, pixels.shape[1], pixels.shape[0])
-    features, descriptors = _features(pixels)
+    with quiet():
+        features, descriptors = sift_features(pixels)
     matched, seen = (np.zeros(0, np.int64),) * 2
     if len(features):
-        matched, seen = match_features(descriptors, landmarks, MATCH_RATIO)
-    answer = _solve(features[matched], landmarks.points[seen], camera, known, seed)
+        matched, seen = match_features(descriptors, index, MATCH_RATIO)
+    answer = _solve(features[matched], index.points[seen], camera, known, seed)
     inliers = 0 if answer is None else int(answer["num_inliers"])
     if answer is None or inliers < MIN_INLIERS:
         raise LocalizationError(
@@ -141,20 +142,6 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
         params=[focal * long_side, width / 2, height / 2, 0.0],
     )
     return camera, known
-
-
-def _features(
-    pixels: UInt8[np.ndarray, "H W 3"],
-) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
-    """SIFT features in the photo's pixels, and their descriptors."""
-    height, width = pixels.shape[:2]
-    grey = Image.fromarray(pixels).convert("L")
-    grey.thumbnail((MAX_IMAGE_SIZE, MAX_IMAGE_SIZE), Image.Resampling.LANCZOS)
-    with quiet():
-        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
-        keypoints, descriptors = extractor.extract_from_uint8_array(np.asarray(grey))
-    found = np.array([(point.x, point.y) for point in keypoints], dtype=np.float64).reshape(-1, 2)
-    return found * [width / grey.width, height / grey.height], np.array(descriptors.data)
 
 
 def _solve(
