@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -190,21 +193,21 @@ def test_landmarks_are_kept_and_made_anew_for_another_model(corner_scene, tmp_pa
     cache = tmp_path / "landmarks.safetensors"
     first = load_feature_index(corner_scene, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(feature_index_module, "_find_landmarks", lambda *_: pytest.fail("found anew"))
+        patch.setattr(feature_index_module, "_build", lambda *_: pytest.fail("found anew"))
         second = load_feature_index(corner_scene, cache)
     assert np.array_equal(first.descriptors, second.descriptors)
     assert np.array_equal(first.points, second.points)
-    monkeypatch.setattr(feature_index_module, "_digest", lambda _: "another model")
+    monkeypatch.setattr(feature_index_module, "_digest", lambda *_: "another model")
     monkeypatch.setattr(
         feature_index_module,
-        "_find_landmarks",
+        "_build",
         lambda *_: FeatureIndex(*(x[:5] for x in vars(first).values())),
     )
     assert len(load_feature_index(corner_scene, cache).points) == 5
 
 
 def test_a_folder_that_cannot_be_written_to_is_no_fault(corner_scene, monkeypatch, corner_landmarks) -> None:
-    monkeypatch.setattr(feature_index_module, "_find_landmarks", lambda *_: corner_landmarks)
+    monkeypatch.setattr(feature_index_module, "_build", lambda *_: corner_landmarks)
     assert len(load_feature_index(corner_scene, Path("/proc/none/landmarks.safetensors")).points)
 
 
@@ -225,3 +228,40 @@ def test_the_ratio_test_looks_at_other_points_only() -> None:
     matched, seen = match_features(features, known, 0.8)
     assert list(matched) == [0]
     assert list(seen) == [0]
+
+
+def test_models_are_read_in_python(corner_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP's own reader believes what files declare, and reads rigs and frames as well."""
+    shutil.copytree(corner_scene, tmp_path / "scene")
+    model = tmp_path / "scene/sparse/0"
+    for name in ("rigs.bin", "frames.bin"):
+        assert (model / name).is_file()
+        (model / name).write_bytes(struct.pack("<Q", 2**60))
+    monkeypatch.setattr(pycolmap, "Reconstruction", lambda *_: pytest.fail("read by COLMAP"))
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *_: pytest.fail("photos read by COLMAP"))
+    index = load_feature_index(tmp_path / "scene")
+    assert len(index.descriptors) > 500
+    data = (model / "images.bin").read_bytes()
+    (model / "images.bin").write_bytes(data[: len(data) // 2])
+    with pytest.raises(UserError, match="cannot be read"):
+        load_feature_index(tmp_path / "scene")
+
+
+def test_text_models_give_the_same_index(corner_scene: Path, corner_landmarks: FeatureIndex, tmp_path: Path) -> None:
+    shutil.copytree(corner_scene / "images", tmp_path / "images")
+    model = pycolmap.Reconstruction(corner_scene / "sparse/0")
+    (tmp_path / "sparse").mkdir()
+    model.write_text(tmp_path / "sparse")
+    index = load_feature_index(tmp_path)
+    np.testing.assert_array_equal(index.descriptors, corner_landmarks.descriptors)
+    np.testing.assert_array_equal(index.owners, corner_landmarks.owners)
+    np.testing.assert_allclose(index.points, corner_landmarks.points, atol=1e-9)
+
+
+def test_names_that_are_not_utf8_are_indexed(corner_scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(corner_scene, tmp_path / "scene")
+    images = tmp_path / "scene/images"
+    (images / "1.png").rename(images / os.fsdecode(b"\xe9.png"))
+    file = tmp_path / "scene/sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"1.png\0", b"\xe9.png\0"))
+    assert len(load_feature_index(tmp_path / "scene", tmp_path / "cache").descriptors) > 500
