@@ -1,9 +1,14 @@
 from pathlib import Path
 
 import pytest
+import torch
+from PIL import Image
 
-from wildgs.cli import depth, sfm
+from wildgs.cli import depth, run, sfm
 from wildgs.cli import main as wildgs
+from wildgs.priors.depth import DepthEstimator
+from wildgs.scene.colmap import read_model
+from wildgs.scene.pictures import depth_file
 from wildgs.sfm.report import SfmReport
 
 
@@ -71,3 +76,40 @@ def test_depth_reports_what_it_wrote(
     depth.run(depth.Command(tmp_path, model="here", device="cpu"))
     assert asked == {"source": "here", "device": "cpu", "required": True}
     assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
+    make_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photos that have depth are not estimated again; once training has begun, depth stays as it was then."""
+    root = make_scene(3)
+    output = tmp_path / "run"
+    output.mkdir()
+    root.rename(output / "scene")
+    names = [image.name for image in read_model(output / "scene").images]
+    estimated: list[int] = []
+
+    class Estimator(DepthEstimator):
+        def __init__(self) -> None:
+            super().__init__(torch.nn.Identity())
+
+        def estimate(self, photo: torch.Tensor) -> torch.Tensor:
+            estimated.append(len(photo))
+            return torch.rand(photo.shape[:2])
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "load_depth_anything", Estimator)
+    monkeypatch.setattr(run, "train_or_go_on", stop)
+    depth_file(output / "scene", names[0]).parent.mkdir()
+    Image.new("I;16", (48, 32)).save(depth_file(output / "scene", names[0]))
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            run.run(run.Command(tmp_path, output))
+        assert len(estimated) == 2
+    depth_file(output / "scene", names[1]).unlink()
+    (output / "config.yaml").write_text("")
+    with pytest.raises(KeyboardInterrupt):
+        run.run(run.Command(tmp_path, output))
+    assert len(estimated) == 2

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from wildgs.errors import UserError
 from wildgs.engine.schedule import Schedule, ScheduleConfig, exponential
+from wildgs.errors import UserError
 
 
 def test_paper_length_keeps_the_papers_steps() -> None:
@@ -22,7 +22,9 @@ def test_paper_length_keeps_the_papers_steps() -> None:
 def test_densification_can_be_switched_off() -> None:
     """Pruning and resets are a part of it; the mask then never pauses."""
     off = Schedule(ScheduleConfig(densify_every=0), 30_000)
-    assert not any(off.densifies(s) or off.resets(s) or off.mask_paused(s) or off.gathers(s) for s in range(30_000))
+    assert not any(
+        off.densifies(s) or off.resets(s) or off.mask_paused(s) or off.gathers(s) for s in range(30_000)
+    )
     without_resets = Schedule(ScheduleConfig(reset_every=0), 3000)
     assert not any(without_resets.resets(s) or without_resets.mask_paused(s) for s in range(3000))
     assert any(without_resets.densifies(s) for s in range(3000))

@@ -230,7 +230,9 @@ def test_the_ratio_test_looks_at_other_points_only() -> None:
     assert list(seen) == [0]
 
 
-def test_models_are_read_in_python(corner_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models_are_read_in_python(
+    corner_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """COLMAP's own reader believes what files declare, and reads rigs and frames as well."""
     shutil.copytree(corner_scene, tmp_path / "scene")
     model = tmp_path / "scene/sparse/0"
@@ -247,7 +249,9 @@ def test_models_are_read_in_python(corner_scene: Path, tmp_path: Path, monkeypat
         load_feature_index(tmp_path / "scene")
 
 
-def test_text_models_give_the_same_index(corner_scene: Path, corner_landmarks: FeatureIndex, tmp_path: Path) -> None:
+def test_text_models_give_the_same_index(
+    corner_scene: Path, corner_landmarks: FeatureIndex, tmp_path: Path
+) -> None:
     shutil.copytree(corner_scene / "images", tmp_path / "images")
     model = pycolmap.Reconstruction(corner_scene / "sparse/0")
     (tmp_path / "sparse").mkdir()

@@ -18,9 +18,11 @@ from wildgs.config import RunConfig
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.priors.depth import fill_depth_folder, load_depth_anything
-from wildgs.runs import default_device, load_run
+from wildgs.runs import CONFIG_FILE, default_device, load_run
 from wildgs.scene import DataConfig, Scene
+from wildgs.scene.colmap import read_model
 from wildgs.scene.images import UnreadableImageError, open_image
+from wildgs.scene.pictures import depth_file
 from wildgs.sfm.reconstruction import SfmConfig
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
@@ -60,6 +62,7 @@ def run(command: Command) -> None:
         console.print(f"{folder} has poses already; going on with them")
     else:
         print_report(reconstruct_with_progress(command.photos, folder, command.sfm))
+    if not (command.output / CONFIG_FILE).is_file():  # once training has begun, depth stays as it was then
         estimate_depth(folder)
     config, scene = _configure(command, folder)
     train_or_go_on(command.output, config, scene)
@@ -79,7 +82,9 @@ def run(command: Command) -> None:
 
 
 def estimate_depth(folder: Path) -> None:
-    """Fills the scene's depth folder where Depth Anything can be had; warns and goes on where not."""
+    """Estimates the depth of photos that have none; warns and goes on if Depth Anything is not available."""
+    if all(depth_file(folder, image.name).is_file() for image in read_model(folder).images):
+        return
     estimator = load_depth_anything()
     if estimator is not None:
         with counting("estimating depth") as progress:

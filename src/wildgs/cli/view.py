@@ -14,6 +14,7 @@ from wildgs.cli.progress import console
 from wildgs.engine.trainer import StepReport, Trainer
 from wildgs.errors import UserError
 from wildgs.files import printable
+from wildgs.processes import TerminatedError, signals_as_interrupts
 from wildgs.scene import Scene
 from wildgs.viewer.jobs import start_worker
 from wildgs.viewer.server import ServerConfig, address, open_server, public_address
@@ -44,10 +45,11 @@ class Command:
 
 def run(command: Command) -> None:
     """Serves the page until interrupted."""
-    viewer = open_viewer(command)
-    print_address(viewer.server, command.server, f"{command.run}")
-    console.print("Ctrl-C ends the viewer")
-    stay(viewer)
+    with signals_as_interrupts():
+        viewer = open_viewer(command)
+        print_address(viewer.server, command.server, f"{command.run}")
+        console.print("Ctrl-C ends the viewer")
+        stay(viewer)
 
 
 def open_viewer(command: Command) -> Viewer:
@@ -77,15 +79,22 @@ def print_address(server: GuardedServer, config: ServerConfig, name: str) -> Non
 
 
 def stay(viewer: Viewer) -> None:
-    """Serves a page whose subject does not change any more, until Ctrl-C."""
+    """Serves a page whose subject does not change any more, until Ctrl-C, SIGTERM or SIGHUP.
+
+    Raises:
+        TerminatedError: A signal other than Ctrl-C came.
+    """
     worker = start_worker(viewer.jobs)
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        console.print("closed")
-    finally:
-        viewer.close()
-        worker.join()
+    with signals_as_interrupts():
+        try:
+            threading.Event().wait()
+        except TerminatedError:
+            raise
+        except KeyboardInterrupt:
+            console.print("closed")
+        finally:
+            viewer.close()
+            worker.join()
 
 
 def watch_training(

@@ -38,7 +38,9 @@ class Schedule:
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
         self.densify_until = self._scaled(config.densify_until, "densify_until")
-        self.densify_every = self._scaled(config.densify_every, "densify_every") if config.densify_every else 0
+        self.densify_every = (
+            self._scaled(config.densify_every, "densify_every") if config.densify_every else 0
+        )
         resets = config.densify_every and config.reset_every
         self.reset_every = self._scaled(config.reset_every, "reset_every") if resets else 0
         self.mask_pause = self._scaled(config.mask_pause, "mask_pause")
