@@ -8,7 +8,7 @@ from wildgs.cli import depth, run, sfm
 from wildgs.cli import main as wildgs
 from wildgs.priors.depth import DepthEstimator
 from wildgs.scene.colmap import read_model
-from wildgs.scene.pictures import depth_file
+from wildgs.scene.photo_store import depth_file
 from wildgs.sfm.report import SfmReport
 
 

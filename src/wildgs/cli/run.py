@@ -22,7 +22,7 @@ from wildgs.runs import CONFIG_FILE, default_device, load_run
 from wildgs.scene import DataConfig, Scene
 from wildgs.scene.colmap import read_model
 from wildgs.scene.images import UnreadableImageError, open_image
-from wildgs.scene.pictures import depth_file
+from wildgs.scene.photo_store import depth_file
 from wildgs.sfm.reconstruction import SfmConfig
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
@@ -54,12 +54,21 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A sparse model: photos with poses, sorted by name, and finite points."""
+    """A sparse model: photos with poses, sorted by name, and finite points.
+
+    Attributes:
+        images_dir: The folder of the photos.
+        images: Photos with poses.
+        points: Positions, in the model's own frame.
+        point_colors: Their colours.
+        observations: Which photo (row in `images`) triangulated which point (row in `points`).
+    """
 
     images_dir: Path
     images: tuple[ColmapImage, ...]
     points: Float[Tensor, "P 3"]
     point_colors: UInt8[Tensor, "P 3"]
+    observations: Int[Tensor, "T 2"]
 
 
 def find_model(root: Path) -> tuple[Path, Path]:
@@ -96,8 +105,12 @@ def read_model(root: Path) -> ColmapModel:
         UserError: The model is missing, cannot be read, holds no photo with a pose or no point.
     """
     folder, images_dir = find_model(root)
-    records = read_records(folder)
-    registered = usable_images(records, folder)
+    binary = all((folder / name).is_file() for name in MODEL_FILES[0])
+    try:
+        records = read_binary(folder) if binary else read_text(folder)
+    except (ModelFileError, OSError, MemoryError) as error:
+        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
+    registered = _usable(records, folder)
     with np.errstate(invalid="ignore"):
         finite = np.all(np.abs(records.points.xyz) < MAX_COORDINATE, axis=1)
     if not finite.any():
@@ -117,32 +130,23 @@ def read_model(root: Path) -> ColmapModel:
     )
     _refuse_repeated([image.name for image in images], folder)
     points, colors = records.points.xyz[finite], records.points.rgb[finite]
-    return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors))
+    observations = _observations(records.points, finite, [image.image_id for image in registered])
+    return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors), observations)
 
 
-def read_records(folder: Path, *, observations: bool = False) -> ModelRecords:
-    """The files of a model, binary where there are both kinds.
-
-    Args:
-        folder: Of the model.
-        observations: Whether to keep where photos show points.
-
-    Raises:
-        UserError: A file cannot be read.
-    """
-    binary = all((folder / name).is_file() for name in MODEL_FILES[0])
-    try:
-        return (read_binary if binary else read_text)(folder, observations=observations)
-    except (ModelFileError, OSError, MemoryError) as error:
-        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
+def _observations(points: PointRecords, finite: np.ndarray, image_ids: Sequence[int]) -> Int[Tensor, "T 2"]:
+    """Rows of photos and of finite points, for every observation of both."""
+    order = np.argsort(np.array(image_ids, dtype=np.int64), kind="stable")
+    ids = np.array(image_ids, dtype=np.int64)[order]
+    found = np.searchsorted(ids, points.track_image).clip(max=len(ids) - 1)
+    usable = (ids[found] == points.track_image) & finite[points.track_point]
+    rows = np.cumsum(finite) - 1
+    pairs = np.stack([order[found[usable]], rows[points.track_point[usable]]], axis=1)
+    return torch.from_numpy(pairs.astype(np.int32))
 
 
-def usable_images(records: ModelRecords, folder: Path) -> list[ImageRecord]:
-    """Photos with a valid camera and pose, by name; the others are named in a warning.
-
-    Raises:
-        UserError: There is none, or two have the same id.
-    """
+def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
+    """Photos with a camera and a pose that mean something, by name; the others are named in a warning."""
     images = sorted(records.images, key=lambda image: image.name)
     if not images:
         raise UserError(

@@ -14,7 +14,6 @@ from wildgs.scene.colmap_records import (
     ImageRecord,
     ModelFileError,
     ModelRecords,
-    Observations,
     PointList,
     PointRecords,
     camera_models,
@@ -25,23 +24,18 @@ _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT = struct.Struct("<Q3d3Bd")
 _COUNT = struct.Struct("<Q")
-_POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
-_TRACK_BYTES = 8
+_POINT2D_BYTES, _TRACK_BYTES = 24, 8
 
 
-def read_binary(folder: Path, *, observations: bool = False) -> ModelRecords:
+def read_binary(folder: Path) -> ModelRecords:
     """Reads cameras.bin, images.bin and points3D.bin.
-
-    Args:
-        folder: Of the model.
-        observations: Whether to keep where photos show points.
 
     Raises:
         ModelFileError: One of them is truncated, too large, or no such file.
     """
     return ModelRecords(
         _read_cameras(_Bytes(folder / "cameras.bin")),
-        _read_images(_Bytes(folder / "images.bin"), observations),
+        _read_images(_Bytes(folder / "images.bin")),
         _read_points(_Bytes(folder / "points3D.bin")),
     )
 
@@ -73,7 +67,7 @@ class _Bytes:
         self._need(size)
         self.position += size
 
-    def array(self, dtype: str | np.dtype, count: int) -> np.ndarray:
+    def array(self, dtype: str, count: int) -> np.ndarray:
         size = np.dtype(dtype).itemsize * count
         self._need(size)
         values = np.frombuffer(self.data, dtype, count, self.position)
@@ -114,18 +108,13 @@ def _read_cameras(file: _Bytes) -> dict[int, Any]:
     return cameras
 
 
-def _read_images(file: _Bytes, observations: bool) -> list[ImageRecord]:
+def _read_images(file: _Bytes) -> list[ImageRecord]:
     images = []
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size)):
         image_id, *pose, camera_id = file.take(_IMAGE)
         name = file.text()
-        count, seen = file.count(_POINT2D.itemsize), None
-        if observations:
-            features = file.array(_POINT2D, count)
-            seen = Observations.of_points(features["xy"], features["point"])
-        else:
-            file.skip(count * _POINT2D.itemsize)
-        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, name, seen))
+        file.skip(file.count(_POINT2D_BYTES) * _POINT2D_BYTES)
+        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
     file.finish()
     return images
 

@@ -1,8 +1,8 @@
 """COLMAP's model as records, and what both of its formats share: nothing in a file is believed.
 
 COLMAP's own reader is C++ and takes the counts that a file declares for true: a damaged or hostile file can end the
-process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". rigs.bin and frames.bin are not read:
-poses are in images.bin as well.
+process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". Observations (points2D) are passed
+over, because nothing here needs them.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Int64, UInt8, UInt64
+from jaxtyping import Float64, Int64, UInt8
 
 MAX_FILE_BYTES = 16 * 2**30
 MAX_NAME_BYTES = 4096
 MAX_CAMERA_SIDE = 10**6
-NO_POINT = 2**64 - 1
-"""Id of the point of a feature that belongs to none; -1 in text files."""
 
 
 class ModelFileError(Exception):
@@ -27,34 +25,14 @@ class ModelFileError(Exception):
 
 
 @dataclass(frozen=True)
-class Observations:
-    """Where a photo shows sparse points.
-
-    Attributes:
-        xy: Places in the photo, pixels.
-        point_ids: Ids of the points.
-    """
-
-    xy: Float64[np.ndarray, "O 2"]
-    point_ids: UInt64[np.ndarray, "O"]
-
-    @classmethod
-    def of_points(cls, xy: np.ndarray, point_ids: np.ndarray) -> Observations:
-        """Leaves out features that belong to no point, and places that are not finite."""
-        known = (point_ids != NO_POINT) & np.isfinite(xy).all(axis=1)
-        return cls(xy[known].astype(np.float64), point_ids[known].astype(np.uint64))
-
-
-@dataclass(frozen=True)
 class ImageRecord:
-    """A photo's pose as stored: world to camera; its observations where they were asked for."""
+    """A photo's pose as stored: world to camera."""
 
     image_id: int
     quat: tuple[float, float, float, float]
     translation: tuple[float, float, float]
     camera_id: int
     name: str
-    observations: Observations | None = None
 
 
 @dataclass
@@ -62,14 +40,12 @@ class PointRecords:
     """Sparse points and which photos see them, in the order of the points' ids.
 
     Attributes:
-        ids: COLMAP's ids.
         xyz: Positions.
         rgb: Colours.
         track_point: For each observation the point's row.
         track_image: For each observation the photo's id.
     """
 
-    ids: UInt64[np.ndarray, "P"]
     xyz: Float64[np.ndarray, "P 3"]
     rgb: UInt8[np.ndarray, "P 3"]
     track_point: Int64[np.ndarray, "T"]
@@ -108,13 +84,11 @@ class PointList:
         """
         if len(set(self.ids)) != len(self.ids):
             raise ModelFileError(f"{where}: two points have one id")
-        ids = np.array(self.ids, dtype=np.uint64)
-        order = np.argsort(ids, kind="stable")
+        order = np.argsort(np.array(self.ids, dtype=np.uint64), kind="stable")
         tracks = [self.tracks[index] for index in order]
         lengths = np.array([len(track) for track in tracks], dtype=np.int64)
         joined = np.concatenate(tracks) if tracks else np.zeros(0)
         return PointRecords(
-            ids=ids[order],
             xyz=np.array(self.xyz, dtype=np.float64).reshape(-1, 3)[order],
             rgb=np.array(self.rgb, dtype=np.uint8).reshape(-1, 3)[order],
             track_point=np.repeat(np.arange(len(tracks), dtype=np.int64), lengths),

@@ -15,33 +15,25 @@ from wildgs.errors import WildGSWarning
 from wildgs.scene.colmap_records import (
     MAX_FILE_BYTES,
     MAX_NAME_BYTES,
-    NO_POINT,
     ImageRecord,
     ModelFileError,
     ModelRecords,
-    Observations,
     PointList,
     PointRecords,
     camera_models,
     make_camera,
 )
 
-NO_POINT_TEXT = str(NO_POINT)
 
-
-def read_text(folder: Path, *, observations: bool = False) -> ModelRecords:
+def read_text(folder: Path) -> ModelRecords:
     """Reads cameras.txt, images.txt and points3D.txt.
-
-    Args:
-        folder: Of the model.
-        observations: Whether to keep where photos show points.
 
     Raises:
         ModelFileError: One of them is too large, or no such file.
     """
     return ModelRecords(
         _read_cameras(folder / "cameras.txt"),
-        _read_images(folder / "images.txt", observations),
+        _read_images(folder / "images.txt"),
         _read_points(folder / "points3D.txt"),
     )
 
@@ -98,7 +90,7 @@ def _read_cameras(path: Path) -> dict[int, Any]:
     return cameras
 
 
-def _read_images(path: Path, observations: bool) -> list[ImageRecord]:
+def _read_images(path: Path) -> list[ImageRecord]:
     """Two lines a photo; the second, its observations, may be empty."""
     images = []
     lines = _lines(path, keep_empty=True)
@@ -112,22 +104,10 @@ def _read_images(path: Path, observations: bool) -> list[ImageRecord]:
         pose = _numbers(where, float, fields[1:8], 7)
         if len(fields[9].encode(errors="surrogateescape")) > MAX_NAME_BYTES:
             raise ModelFileError(f"{where}: a name of more than {MAX_NAME_BYTES} bytes")
-        place, features = next(lines, (where, ""))
-        seen = _observations(place, features.split()) if observations else None
-        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, fields[9], seen))
+        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, fields[9]))
+        next(lines, None)
     _check_count(path, len(images))
     return images
-
-
-def _observations(where: str, fields: list[str]) -> Observations:
-    """X, y and the point's id (-1: none) of every feature."""
-    if len(fields) % 3:
-        raise ModelFileError(f"{where}: {len(fields)} numbers, and a feature has three")
-    xy = [_numbers(where, float, fields[axis::3], 0) for axis in (0, 1)]
-    ids = _numbers(where, int, [NO_POINT_TEXT if text == "-1" else text for text in fields[2::3]], 0)
-    return Observations.of_points(
-        np.array(xy, dtype=np.float64).T.reshape(-1, 2), np.array(ids, dtype=np.uint64)
-    )
 
 
 def _read_points(path: Path) -> PointRecords:
