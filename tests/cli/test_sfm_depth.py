@@ -4,11 +4,11 @@ import pytest
 import torch
 from PIL import Image
 
-from wildgs.cli import depth, run, sfm
+from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
+from wildgs.library import pipeline
 from wildgs.priors.depth import DepthEstimator
-from wildgs.scene.colmap import read_model
-from wildgs.scene.photo_store import depth_file
+from wildgs.sfm import reconstruction
 from wildgs.sfm.report import SfmReport
 
 
@@ -50,7 +50,7 @@ def test_progress_and_report_are_printed(
         progress("undistorting", 0, 0)
         return report
 
-    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    monkeypatch.setattr(reconstruction, "reconstruct", reconstruct)
     sfm.run(sfm.Command(Path("p"), Path("s"), overwrite=True))
     printed = capsys.readouterr().out
     assert "reading photos: 3 done" in printed
@@ -71,8 +71,8 @@ def test_depth_reports_what_it_wrote(
         progress(3, 3)
         return 2, 1
 
-    monkeypatch.setattr(depth, "load_depth_anything", load)
-    monkeypatch.setattr(depth, "fill_depth_folder", fill)
+    monkeypatch.setattr(pipeline, "load_depth_anything", load)
+    monkeypatch.setattr(pipeline, "fill_depth_folder", fill)
     depth.run(depth.Command(tmp_path, model="here", device="cpu"))
     assert asked == {"source": "here", "device": "cpu", "required": True}
     assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")
@@ -86,7 +86,7 @@ def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
     output = tmp_path / "run"
     output.mkdir()
     root.rename(output / "scene")
-    names = [image.name for image in read_model(output / "scene").images]
+    depth_folder = output / "scene/depth"
     estimated: list[int] = []
 
     class Estimator(DepthEstimator):
@@ -97,19 +97,20 @@ def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
             estimated.append(len(photo))
             return torch.rand(photo.shape[:2])
 
-    def stop(*_: object) -> None:
+    def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "load_depth_anything", Estimator)
-    monkeypatch.setattr(run, "train_or_go_on", stop)
-    depth_file(output / "scene", names[0]).parent.mkdir()
-    Image.new("I;16", (48, 32)).save(depth_file(output / "scene", names[0]))
+    monkeypatch.setattr(pipeline, "load_depth_anything", Estimator)
+    monkeypatch.setattr(pipeline, "_pose", lambda *_: None)
+    monkeypatch.setattr(pipeline, "train", stop)
+    depth_folder.mkdir()
+    Image.new("I;16", (48, 32)).save(depth_folder / "p00.png")
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            run.run(run.Command(tmp_path, output))
+            pipeline.run(output / "scene/images", output)
         assert len(estimated) == 2
-    depth_file(output / "scene", names[1]).unlink()
+    (depth_folder / "p01.png").unlink()
     (output / "config.yaml").write_text("")
     with pytest.raises(KeyboardInterrupt):
-        run.run(run.Command(tmp_path, output))
+        pipeline.run(output / "scene/images", output)
     assert len(estimated) == 2
