@@ -18,8 +18,7 @@ import yaml.composer
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
-from wildgs.model.registry import MethodName
-from wildgs.model.wildgs import WildGSConfig
+from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, method_type
 from wildgs.scene import DataConfig
 
 MAX_CONFIG_BYTES = 1_000_000
@@ -31,17 +30,31 @@ class RunConfig:
 
     Attributes:
         scene: The scene folder.
-        method: `wildgs`, or `3dgs` for the paper's baseline.
+        method: A name in `wildgs.model.registry.METHODS`.
         data: How the scene is read.
-        model: Wild-GS; without effect on `3dgs`.
+        model: The method's own options, an instance of its `Config`; None takes the defaults.
         train: Training.
     """
 
     scene: Path
-    method: MethodName = "wildgs"
+    method: MethodName = DEFAULT_METHOD
     data: DataConfig = field(default_factory=DataConfig)
-    model: WildGSConfig = field(default_factory=WildGSConfig)
+    model: Any = None
     train: TrainConfig = field(default_factory=TrainConfig)
+
+    def __post_init__(self) -> None:
+        """Fills in the method's default options, and refuses those of another method."""
+        kind = method_type(self.method).Config
+        if self.model is None:
+            object.__setattr__(self, "model", kind())
+        elif not isinstance(self.model, kind):
+            raise TypeError(
+                f"method {self.method} takes a {kind.__name__}, not a {type(self.model).__name__}"
+            )
+
+    def with_method(self, method: MethodName) -> RunConfig:
+        """The same run by another method, with that method's default options."""
+        return self if method == self.method else dataclasses.replace(self, method=method, model=None)
 
 
 def to_plain(value: Any) -> Any:
@@ -93,6 +106,13 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: expected a mapping, found {_shortened(value)}")
     hints = typing.get_type_hints(kind)
+    if kind is RunConfig:
+        try:
+            method_type(_method_of(value))
+        except UserError as error:
+            raise UserError(f"{where}.{error}") from error
+        value = _upgraded(value)
+        hints["model"] = method_type(_method_of(value)).Config
     known = {f.name for f in dataclasses.fields(kind)}
     if unknown := sorted(map(str, set(value) - known)):
         raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; known are {', '.join(sorted(known))}")
@@ -100,6 +120,53 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if lacking := sorted(required - set(value)):
         raise UserError(f"{where}: the entry {lacking[0]!r} is missing")
     return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
+
+
+def _method_of(plain: dict[str, Any]) -> str:
+    return str(plain.get("method", DEFAULT_METHOD))
+
+
+_MOVED_RATES = {
+    "intrinsic": "intrinsic",
+    "networks": "networks",
+    "encoder": "encoder",
+    "network_decay": "decay",
+    "sh0": "sh0",
+    "shN": "shN",
+}
+"""From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
+
+
+def _upgraded(plain: dict[str, Any]) -> dict[str, Any]:
+    """A run's configuration as an earlier version wrote it, in today's form.
+
+    Learning rates of a method's own parameters were entries of `train.optimizer`, every method carried the default
+    method's options, and `train.objective` repeated the mask's threshold.
+    """
+    known = _entries(method_type(_method_of(plain)).Config)
+    model = plain.get("model")
+    if isinstance(model, dict):
+        foreign = _entries(METHODS[DEFAULT_METHOD].Config).keys() - known.keys()
+        plain = plain | {"model": {name: value for name, value in model.items() if name not in foreign}}
+    train = plain.get("train")
+    optimizer = train.get("optimizer") if isinstance(train, dict) else None
+    if not isinstance(train, dict) or not isinstance(optimizer, dict):
+        return plain
+    moved = {name: optimizer[name] for name in _MOVED_RATES if name in optimizer}
+    if not moved:
+        return plain
+    kept = {name: value for name, value in optimizer.items() if name not in moved}
+    objective = {n: v for n, v in (train.get("objective") or {}).items() if n != "mask_threshold"}
+    plain = plain | {"train": train | {"optimizer": kept, "objective": objective}}
+    own = _entries(known["learning_rates"]) if "learning_rates" in known else {}
+    rates = {_MOVED_RATES[name]: value for name, value in moved.items() if _MOVED_RATES[name] in own}
+    return plain | {"model": (plain.get("model") or {}) | ({"learning_rates": rates} if rates else {})}
+
+
+def _entries(kind: Any) -> dict[str, Any]:
+    """Names and types of a dataclass's entries."""
+    hints = typing.get_type_hints(kind)
+    return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
 
 
 def _is_required(entry: dataclasses.Field[Any]) -> bool:
@@ -159,7 +226,7 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 
     Args:
         config: Left as it is.
-        entries: From an entry's path, as in ``train.optimizer.networks``, to its plain value.
+        entries: From an entry's path, as in ``model.learning_rates.networks``, to its plain value.
         where: Named in errors.
 
     Raises:
@@ -180,7 +247,8 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[Any, Any]]:
     """Paths of the entries in which two configurations differ, each with both plain values."""
     one, other = _flat(to_plain(first)), _flat(to_plain(second))
-    return {path: (value, other[path]) for path, value in one.items() if value != other[path]}
+    paths = dict.fromkeys([*one, *other])
+    return {p: (one.get(p), other.get(p)) for p in paths if one.get(p) != other.get(p)}
 
 
 def _flat(plain: Any, path: str = "") -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
-from wildgs.config import RunConfig, with_entries
+from wildgs.config import RunConfig, to_plain, with_entries
 
 PresetName = Literal["default", "paper", "fast"]
 PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
@@ -47,9 +47,23 @@ PRESETS: dict[PresetName, Preset] = {
 
 
 def with_preset(config: RunConfig, name: PresetName) -> RunConfig:
-    """A configuration with a preset's entries and share of the steps."""
+    """A configuration with a preset's entries and share of the steps.
+
+    Entries that the configuration's method does not have are left out.
+    """
     preset = PRESETS[name]
-    changed = with_entries(config, preset.entries, f"preset {name}")
+    entries = {path: value for path, value in preset.entries.items() if _has(config, path)}
+    changed = with_entries(config, entries, f"preset {name}")
     return replace(
         changed, train=replace(changed.train, steps=max(1, round(preset.steps * config.train.steps)))
     )
+
+
+def _has(config: RunConfig, path: str) -> bool:
+    """Whether a configuration has an entry."""
+    plain: Any = to_plain(config)
+    for name in path.split("."):
+        if not isinstance(plain, dict) or name not in plain:
+            return False
+        plain = plain[name]
+    return True

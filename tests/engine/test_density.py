@@ -7,7 +7,7 @@ import torch
 
 from wildgs.engine.density import DensityConfig, DensityControl
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
-from wildgs.model.vanilla import VanillaGS
+from wildgs.model.vanilla import VanillaConfig, VanillaGS
 
 EXTENT = 1.0
 
@@ -16,7 +16,7 @@ EXTENT = 1.0
 def method() -> VanillaGS:
     """Four Gaussians: small, large, faint, and one that does nothing."""
     torch.manual_seed(0)
-    method = VanillaGS.from_points(torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.uint8))
+    method = VanillaGS.from_points(VanillaConfig(), torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.uint8))
     with torch.no_grad():
         method.gaussians.rows["log_scales"].copy_(torch.tensor([0.005, 0.05, 0.005, 0.005]).log()[:, None])
         method.gaussians.rows["opacity_logits"].copy_(torch.tensor([0.9, 0.9, 0.001, 0.9]).logit())

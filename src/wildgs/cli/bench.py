@@ -14,11 +14,9 @@ from rich.table import Table
 
 from wildgs import processes
 from wildgs.cli.bench_plan import (
-    LABELS,
-    METHODS,
     PHOTOTOURISM_DOWNSCALE,
-    BenchMethod,
     Job,
+    bench_labels,
     find_phototourism,
     make_jobs,
     parse_variant,
@@ -41,6 +39,7 @@ from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
 from wildgs.files import written_aside
+from wildgs.model.registry import DEFAULT_METHOD
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import CHECKPOINT_FOLDER, load_run
 from wildgs.scene import DataConfig, Scene
@@ -70,11 +69,11 @@ class Command:
     preset: Literal["phototourism"] | None = None
     """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, beside the paper's
     figures."""
-    methods: tuple[BenchMethod, ...] = METHODS
-    """3dgs, wildgs, wildgs-half-steps (the paper's †), and the ablations."""
+    methods: tuple[str, ...] = tuple(bench_labels())
+    """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART)."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME:KEY=VALUE[,KEY=VALUE...], a further line of the table: Wild-GS with entries of config.yaml changed,
-    as in slow:train.optimizer.networks=5e-4. May be repeated."""
+    as in slow:model.learning_rates.networks=5e-4. May be repeated."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run each."""
     lpips: Path | None = None
@@ -146,7 +145,7 @@ def _plan(command: Command) -> list[Job]:
         raise UserError("--seed: a bench takes its seeds from --seeds")
     if not command.scenes or not command.seeds or not (command.methods or command.variant):
         raise UserError("a bench needs at least one scene, one of --methods or --variant, and one of --seeds")
-    base = RunConfig(Path(), "wildgs", command.data, command.model, command.train)
+    base = RunConfig(Path(), DEFAULT_METHOD, command.data, command.model, command.train)
     scenes: Sequence[Path] = command.scenes
     if command.preset == "phototourism":
         scenes = find_phototourism(scenes)
@@ -218,7 +217,7 @@ class _Bench:
             if (metrics := read_metrics(job.folder, protocol)) is not None
         ]
         labels = dict.fromkeys([job.method for job in self.jobs])
-        names = {name: LABELS.get(name, name) for name in labels}
+        names = {name: bench_labels().get(name, name) for name in labels}
         preset = self.command.preset is not None
         rows = summarize(
             scores,

@@ -8,49 +8,39 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import yaml
 
 from wildgs.config import RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
-from wildgs.model.wildgs import WildGSConfig
-from wildgs.presets import with_preset
+from wildgs.model.registry import DEFAULT_METHOD, METHODS
+from wildgs.model.wildgs import Ablation
+from wildgs.presets import PRESET_NAMES, PRESETS, with_preset
 from wildgs.runs import CONFIG_FILE
 from wildgs.scene.colmap import find_model
 from wildgs.scene.split import find_split_file
 
-BenchMethod = Literal[
-    "3dgs",
-    "wildgs-half-steps",
-    "wildgs",
-    "paper",
-    "fast",
-    "without-crop",
-    "without-reverse",
-    "without-global",
-    "without-mask",
-    "without-depth",
-    "without-intrinsic",
-    "without-local",
-]
-METHODS: tuple[BenchMethod, ...] = get_args(BenchMethod)
-LABELS: dict[str, str] = {
-    "3dgs": "3DGS",
-    "wildgs-half-steps": "Wild-GS†",
-    "wildgs": "Wild-GS",
-    "paper": "preset paper",
-    "fast": "preset fast",
-    "without-crop": "w/o Crop",
-    "without-reverse": "w/o {c'}",
-    "without-global": "w/o Global",
-    "without-mask": "w/o Mask",
-    "without-depth": "w/o Depth",
-    "without-intrinsic": "w/o Intrinsic",
-    "without-local": "w/o Local",
-}
-"""As the paper's table has them."""
+_HALF = "-half-steps"
+_WITHOUT = "without-"
+_ABLATION_LABELS = {"reverse": "w/o {c'}"}
+
+
+def bench_labels() -> dict[str, str]:
+    """Everything the bench can run, and its label in the table: methods, presets, and the paper's ablations."""
+    default = METHODS[DEFAULT_METHOD]
+    return {
+        **{name: method.label for name, method in METHODS.items() if name != DEFAULT_METHOD},
+        DEFAULT_METHOD + _HALF: default.label + "†",
+        DEFAULT_METHOD: default.label,
+        **{name: f"preset {name}" for name in PRESET_NAMES if name != "default"},
+        **{
+            _WITHOUT + part: _ABLATION_LABELS.get(part, f"w/o {part.capitalize()}")
+            for part in get_args(Ablation)
+        },
+    }
+
 
 PHOTOTOURISM_DOWNSCALE = 2
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
@@ -72,7 +62,7 @@ class Job:
 
     Attributes:
         scene: The scene's name in the table.
-        method: A `BenchMethod` or a variant's name.
+        method: A name from `bench_labels`, or a variant's.
         seed: Of the run.
         folder: Its run folder.
         config: Its configuration.
@@ -87,7 +77,7 @@ class Job:
     @property
     def title(self) -> str:
         """For the console."""
-        return f"{self.scene}, {LABELS.get(self.method, self.method)}, seed {self.seed}"
+        return f"{self.scene}, {bench_labels().get(self.method, self.method)}, seed {self.seed}"
 
 
 def parse_variant(text: str) -> Variant:
@@ -99,9 +89,9 @@ def parse_variant(text: str) -> Variant:
     name, colon, rest = text.partition(":")
     if not colon or not _NAME.fullmatch(name):
         raise UserError(
-            f"--variant {text}: expected NAME:KEY=VALUE, for example slow:train.optimizer.networks=5e-4"
+            f"--variant {text}: expected NAME:KEY=VALUE, for example slow:model.learning_rates.networks=5e-4"
         )
-    if name in METHODS:
+    if name in bench_labels():
         raise UserError(f"--variant {text}: {name} is a method of the bench; choose another name")
     entries: dict[str, Any] = {}
     for entry in _NEXT_ENTRY.split(rest):
@@ -156,7 +146,7 @@ def find_phototourism(places: Sequence[Path]) -> tuple[Path, ...]:
 def make_jobs(
     scenes: Sequence[Path],
     base: RunConfig,
-    methods: Sequence[BenchMethod],
+    methods: Sequence[str],
     variants: Sequence[Variant],
     seeds: Sequence[int],
     output: Path,
@@ -200,18 +190,21 @@ def _check_unique(what: str, names: Sequence[str]) -> None:
             raise UserError(f"{what}: {name} is there twice; the table needs different names")
 
 
-def method_config(method: BenchMethod, base: RunConfig) -> RunConfig:
-    """The configuration of one of the bench's methods."""
-    if method == "3dgs":
-        return replace(base, method="3dgs", model=WildGSConfig())  # on which the model has no effect
-    if method == "wildgs-half-steps":
+def method_config(method: str, base: RunConfig) -> RunConfig:
+    """The configuration of one of the bench's methods.
+
+    Raises:
+        UserError: There is no such method.
+    """
+    if method not in bench_labels():
+        raise UserError(f"--methods {method}: unknown; choose from {', '.join(bench_labels())}")
+    if method in METHODS:
+        return base.with_method(method)
+    if method.endswith(_HALF):
         return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
-    if method == "wildgs":
-        return base
-    if method in ("paper", "fast"):
+    if method in PRESETS:
         return with_preset(base, method)
-    part = method.removeprefix("without-")
-    return with_entries(base, {"model.without": [*base.model.without, part]})
+    return with_entries(base, {"model.without": [*base.model.without, method.removeprefix(_WITHOUT)]})
 
 
 def _check_stored(job: Job) -> None:

@@ -16,11 +16,10 @@ from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.parsing import ParsingConfig
-from wildgs.model.registry import MethodName
+from wildgs.model.registry import METHODS
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import load_run
 
-TITLES: dict[MethodName, str] = {"wildgs": "Wild-GS", "3dgs": "3DGS"}
 SUMMARY = (
     "A landmark made in code and photographed by {photos} imagined visitors: other hours, other cameras, people in "
     "the way. Wild-GS and plain 3D Gaussian Splatting were trained on their photos for the same number of steps; "
@@ -66,7 +65,7 @@ def run(command: Command) -> None:
             )
     runs = []
     for method in ("wildgs", "3dgs"):
-        config = RunConfig(folder.resolve(), method, model=MODEL, train=_training(command.steps))
+        config = RunConfig(folder.resolve(), model=MODEL, train=_training(command.steps)).with_method(method)
         scene = read_scene(config)
         target = command.output / method
         train_or_go_on(target, config, scene)
@@ -75,7 +74,7 @@ def run(command: Command) -> None:
             "full": evaluate_run(loaded, scene, "full"),
             "half": evaluate_run(loaded, scene, "half"),
         }
-        runs.append((TITLES[method], loaded, scores))
+        runs.append((METHODS[method].label, loaded, scores))
     print_scores({name: scores for name, _, scores in runs})
     write_showcase(page, "Wild-GS demo", SUMMARY.format(photos=command.photos), scene, runs)
     scene_page = command.output / "scene.html"

@@ -95,7 +95,7 @@ def _configure(command: Command, folder: Path) -> tuple[RunConfig, Scene]:
     most = command.max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
     budget = DensityConfig(max_gaussians=most)
     train = TrainConfig(steps=steps, density=budget)
-    config = RunConfig(folder.resolve(), "wildgs", data, train=train)
+    config = RunConfig(folder.resolve(), data=data, train=train)
     return config, read_scene(config)
 
 

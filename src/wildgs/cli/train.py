@@ -6,7 +6,7 @@ import argparse
 from contextlib import ExitStack
 from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -17,8 +17,7 @@ from wildgs.engine.autosave import AutosaveConfig
 from wildgs.engine.distributed import join
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig
-from wildgs.model.registry import MethodName
-from wildgs.model.wildgs import WildGSConfig
+from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, method_type
 from wildgs.presets import PRESET_NAMES, PresetName, with_preset
 from wildgs.runs import (
     CONFIG_FILE,
@@ -40,8 +39,8 @@ class Command:
     """Scene folder: images/ and sparse/0/ (see docs/scene.md)."""
     output: Path
     """Run folder to write."""
-    method: MethodName = "wildgs"
-    """wildgs, or 3dgs for plain 3D Gaussian Splatting on the same engine."""
+    method: MethodName = DEFAULT_METHOD
+    """Method to train; `--method NAME --help` lists its options. 3dgs is plain 3D Gaussian Splatting."""
     preset: PresetName = "default"
     """default: the best measured; paper: nothing that the paper does not have; fast: half the steps and a lighter
     2D Parsing. Other options change what the preset sets."""
@@ -50,7 +49,7 @@ class Command:
     max_gaussians: int | None = None
     """Most Gaussians; by default what `--density.max-gaussians` says, or less where memory is short."""
     data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
+    model: Any = None  # `command_for` gives it the type of the method's options
     train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     autosave: Annotated[AutosaveConfig, tyro.conf.arg(name="")] = field(default_factory=AutosaveConfig)
     view: bool = False
@@ -59,18 +58,21 @@ class Command:
 
 
 def command_for(arguments: list[str]) -> type[Command]:
-    """The command with what the preset among the arguments sets as its options' defaults."""
+    """The command with the options of the method among the arguments, and the preset's values as defaults."""
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     finder.add_argument("--preset", choices=PRESET_NAMES, default="default")
+    finder.add_argument("--method", choices=tuple(METHODS), default=DEFAULT_METHOD)
     try:
-        name: PresetName = finder.parse_known_args(arguments)[0].preset
+        found = finder.parse_known_args(arguments)[0]
     except argparse.ArgumentError:
-        return Command  # tyro tells what is wrong
-    config = with_preset(RunConfig(Path()), name)
+        found = finder.parse_args([])  # tyro reports what is wrong
+    config = with_preset(RunConfig(Path(), found.method), found.preset)
     unnamed = tyro.conf.arg(name="")
+    method = Literal[tuple(METHODS)]  # pyright: ignore[reportInvalidTypeForm]
     fields = [
         ("data", Annotated[DataConfig, unnamed], field(default=config.data)),
-        ("model", Annotated[WildGSConfig, unnamed], field(default=config.model)),
+        ("method", method, field(default=found.method)),
+        ("model", Annotated[method_type(found.method).Config, unnamed], field(default=config.model)),
         ("train", Annotated[TrainConfig, unnamed], field(default=config.train)),
     ]
     return make_dataclass("Command", fields, bases=(Command,), frozen=True)

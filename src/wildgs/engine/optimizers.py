@@ -12,14 +12,13 @@ from torch import Tensor, nn
 
 from wildgs.engine.schedule import exponential
 from wildgs.geometry.morton import morton_order
-from wildgs.model.encoder import Encoder
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.method import Method
+from wildgs.model.method import LearningRate, Method
 
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Learning rates. Those of the Gaussians are 3DGS's.
+    """Learning rates of the geometry, 3DGS's; a method has those of its own parameters (`model.learning_rates`).
 
     Attributes:
         means: Position, at the start, per unit of scene extent.
@@ -27,13 +26,6 @@ class OptimizerConfig:
         scales: Logarithms of the scales.
         quats: Orientations.
         opacities: Opacity logits.
-        sh0: Flat colour (3dgs only).
-        shN: Higher harmonics (3dgs only).
-        intrinsic: Intrinsic features (wildgs only).
-        networks: All networks but the encoder, at the start.
-        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
-            thousand steps, and the embedding of every photo becomes the same.
-        network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
         batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
             rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
     """
@@ -43,16 +35,16 @@ class OptimizerConfig:
     scales: float = 5e-3
     quats: float = 1e-3
     opacities: float = 5e-2
-    sh0: float = 2.5e-3
-    shN: float = 1.25e-4  # noqa: N815 - the field's name
-    intrinsic: float = 2.5e-3
-    networks: float = 1e-3
-    encoder: float = 1e-4
-    network_decay: float = 0.1
     batch_scaling: Literal["sqrt", "none"] = "sqrt"
 
-
-_ROW_RATES = {"log_scales": "scales", "opacity_logits": "opacities"}
+    def geometry(self, extent: float) -> dict[str, LearningRate]:
+        """Rates of the rows that every method has; `extent` scales positions."""
+        return {
+            "means": LearningRate(self.means * extent, self.means_final / self.means),
+            "quats": LearningRate(self.quats),
+            "log_scales": LearningRate(self.scales),
+            "opacity_logits": LearningRate(self.opacities),
+        }
 
 
 @dataclass
@@ -60,13 +52,17 @@ class Optimizers:
     """Adam over the per-Gaussian rows (one group a row) and over the networks.
 
     Attributes:
+        config: Of the geometry.
+        row_rates: Learning rate of every row.
+        network_rates: Learning rate of every other group, by its name.
         rows: For `Gaussians.rows`; eps 1e-15 as 3DGS.
         networks: For everything else, or None where a method has nothing else.
         photos: Photos in the mean gradient of one step.
     """
 
     config: OptimizerConfig
-    extent: float
+    row_rates: dict[str, LearningRate]
+    network_rates: dict[str, LearningRate]
     rows: torch.optim.Adam
     networks: torch.optim.Adam | None = field(default=None)
     photos: int = 1
@@ -83,25 +79,22 @@ class Optimizers:
         """
         scaled = photos if config.batch_scaling == "sqrt" else 1
         rate, betas = scaled**0.5, (0.9**scaled, 0.999**scaled)
+        row_rates = config.geometry(extent) | method.row_rates()
         groups = [
-            {"params": [parameter], "name": name, "lr": rate * _row_rate(config, name, extent)}
+            {"params": [parameter], "name": name, "lr": rate * row_rates[name].start}
             for name, parameter in method.gaussians.rows.items()
         ]
         rows = torch.optim.Adam(groups, betas=betas, eps=1e-15 / rate, fused=True)
-        owned = {id(p) for p in method.gaussians.parameters()}
-        encoder = [m for m in method.modules() if isinstance(m, Encoder)]
-        encoder_parameters = [p for m in encoder for p in m.parameters()]
-        owned |= {id(p) for p in encoder_parameters}
-        others = [p for p in method.parameters() if id(p) not in owned]
+        declared = [group for group in method.parameter_groups() if group.parameters]
         network_groups = [
-            {"params": others, "name": "networks", "lr": rate * config.networks},
-            {"params": encoder_parameters, "name": "encoder", "lr": rate * config.encoder},
+            {"params": group.parameters, "name": group.name, "lr": rate * group.rate.start}
+            for group in declared
         ]
-        network_groups = [group for group in network_groups if group["params"]]
         networks = None
         if network_groups:
             networks = torch.optim.Adam(network_groups, betas=betas, eps=1e-8 / rate, fused=True)
-        return cls(config, extent, rows, networks, photos)
+        network_rates = {group.name: group.rate for group in declared}
+        return cls(config, row_rates, network_rates, rows, networks, photos)
 
     @property
     def rate(self) -> float:
@@ -110,17 +103,10 @@ class Optimizers:
 
     def set_progress(self, progress: float) -> None:
         """Moves every learning rate to where it belongs at a share of the run in [0, 1]."""
-        config = self.config
-        decay = self.rate * exponential(1.0, config.network_decay, progress)
-        for group in self.rows.param_groups:
-            if group["name"] == "means":
-                rate = self.rate * self.extent
-                group["lr"] = rate * exponential(config.means, config.means_final, progress)
-            elif group["name"] == "intrinsic":
-                group["lr"] = config.intrinsic * decay
-        if self.networks is not None:
-            for group in self.networks.param_groups:
-                group["lr"] = getattr(config, group["name"]) * decay
+        for optimizer, rates in ((self.rows, self.row_rates), (self.networks, self.network_rates)):
+            for group in [] if optimizer is None else optimizer.param_groups:
+                chosen = rates[group["name"]]
+                group["lr"] = chosen.start * (self.rate * exponential(1.0, chosen.decay, progress))
 
     def step(self) -> None:
         """One Adam step everywhere, then clears the gradients."""
@@ -164,11 +150,6 @@ def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
     if value.shape != parameter.shape:
         return value.to(parameter.device)
     return torch.empty_like(parameter, requires_grad=False).copy_(value)
-
-
-def _row_rate(config: OptimizerConfig, name: str, extent: float) -> float:
-    rate = getattr(config, _ROW_RATES.get(name, name))
-    return rate * extent if name == "means" else rate
 
 
 @torch.no_grad()

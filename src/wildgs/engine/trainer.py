@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -39,11 +39,11 @@ class TrainConfig:
 
     Attributes:
         steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
-        seed: Of everything random.
+        seed: Random seed.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         objective: Loss weights.
-        schedule: What happens when.
+        schedule: Training schedule.
         optimizer: Learning rates.
         density: Densification and pruning.
     """
@@ -127,7 +127,6 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.schedule = Schedule(config.schedule, config.steps)
-        self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
@@ -201,10 +200,10 @@ class Trainer:
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view), self.feed.keep(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep)
+        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
-            self._objective,
+            self.config.objective,
             self.schedule.progress(self.step),
             photo,
             output.rendering.colors,
@@ -214,6 +213,7 @@ class Trainer:
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
             train_mask=stage.learn_mask,
+            mask_threshold=self.method.mask_threshold,
         )
         return output, losses
 

@@ -21,7 +21,7 @@ def encode_view(method: Method, view: View) -> Appearance:
     device = method.gaussians.means.device
     mask = view.read_mask()
     keep = None if mask is None else mask.to(device) > 0
-    return method.encode(_unit(view.read_photo(), device), view.camera.to(device), keep)
+    return method.encode(_unit(view.read_photo(), device), view.camera.to(device), keep, name=view.name)
 
 
 @torch.no_grad()

@@ -22,7 +22,6 @@ class ObjectiveConfig:
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
         depth_weight: λ^D (paper: 0.05).
-        mask_threshold: Th, above which a pixel counts as static for the depth loss.
         min_alpha: Least accumulated alpha of a pixel whose rendered depth is compared.
     """
 
@@ -30,7 +29,6 @@ class ObjectiveConfig:
     mask_weight_start: float = 0.4
     mask_weight_end: float = 0.1
     depth_weight: float = 0.01
-    mask_threshold: float = 0.5
     min_alpha: float = 0.5
 
     def mask_weight(self, progress: float) -> float:
@@ -74,6 +72,7 @@ def total_loss(
     alpha: Float[Tensor, "H W"] | None = None,
     disparity: Float[Tensor, "H W"] | None = None,
     train_mask: bool = True,
+    mask_threshold: float = 0.5,
 ) -> Losses:
     """The paper's L_total for one photo.
 
@@ -88,6 +87,7 @@ def total_loss(
         alpha: Accumulated alpha of the render; pixels below `min_alpha` are left out of the depth loss.
         disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
         train_mask: False passes no gradient to the mask (the pause after an opacity reset).
+        mask_threshold: Th: the depth loss leaves out pixels whose M is not above it.
 
     Returns:
         All terms.
@@ -103,7 +103,7 @@ def total_loss(
     if depth is not None and disparity is not None:
         selection = torch.ones_like(depth, dtype=torch.bool) if keep is None else keep
         if visibility is not None:
-            selection = selection & (visibility.detach() > config.mask_threshold)
+            selection = selection & (visibility.detach() > mask_threshold)
         if alpha is not None:
             selection = selection & (alpha.detach() > config.min_alpha)
         depth_term = depth_correlation(depth, disparity, selection)

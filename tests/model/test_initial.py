@@ -7,7 +7,7 @@ import torch
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.ground import ground_rows
+from wildgs.model.initial import ground_rows, initial_from_points
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGS, WildGSConfig
@@ -43,7 +43,8 @@ def test_models_have_it_where_it_is_given() -> None:
     points, colors = torch.rand(30, 3), torch.randint(0, 256, (30, 3), dtype=torch.uint8)
     config = WildGSConfig(parsing=ParsingConfig(max_side=32), sky=SkyConfig(points=0))
     ground = grid(0.5), torch.full((16, 3), 200, dtype=torch.uint8)
-    model = WildGS.from_points(config, points, colors, load_encoder(None), ground=ground)
+    initial = initial_from_points(WildGS.initial(config), points, colors, ground=ground)
+    model = WildGS.create(config, initial, load_encoder(None))
     assert len(model.gaussians) == 30 + 16
     assert torch.equal(model.gaussians.means[30:].detach(), ground[0])
     sh0 = model.fusion.initial_intrinsic(torch.full((1, 3), 200 / 255))[0, :3]
