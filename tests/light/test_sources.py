@@ -143,7 +143,7 @@ def test_mistakes(sources, picture, tmp_path, spec, like, words) -> None:
 
 def test_plain_3dgs_gives_its_own_light_and_says_so(vanilla, wall) -> None:
     sources = LightSources(vanilla, lambda: wall)
-    with pytest.warns(WildGSWarning, match="one light"):
+    with pytest.warns(WildGSWarning, match="cannot be relit"):
         look = sources.find("0.jpg")
     assert look is sources.find(NEUTRAL)
     assert look.embeddings is None

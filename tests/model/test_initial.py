@@ -1,17 +1,31 @@
-"""Discs that continue the ground: flat, opaque, overlapping, and part of a model where there are some."""
+"""The first Gaussians: within their budget, and the ground's discs flat, opaque and overlapping."""
 
 from __future__ import annotations
 
-import torch
+from pathlib import Path
 
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wildgs.errors import WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.initial import ground_rows, initial_from_points
+from wildgs.model.initial import (
+    InitialBudget,
+    InitialConfig,
+    ground_rows,
+    initial_from_points,
+    initial_gaussians,
+)
 from wildgs.model.parsing import ParsingConfig
+from wildgs.model.registry import METHODS
 from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.rasterize import blend
+from wildgs.scene import Alignment, Scene
 
 
 def grid(spacing: float) -> torch.Tensor:
@@ -49,3 +63,56 @@ def test_models_have_it_where_it_is_given() -> None:
     assert torch.equal(model.gaussians.means[30:].detach(), ground[0])
     sh0 = model.fusion.initial_intrinsic(torch.full((1, 3), 200 / 255))[0, :3]
     torch.testing.assert_close(model.gaussians.rows["intrinsic"][30:, :3].detach(), sh0.expand(16, 3))
+
+
+def bare_scene(points: int) -> Scene:
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(points, 3, generator=generator)
+    return Scene(Path("bare"), (), places, torch.zeros(points, 3, dtype=torch.uint8), Alignment.identity())
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    budget=st.integers(1, 100_000),
+    found=st.integers(1, 200_000),
+    sky=st.integers(0, 10_000),
+    dense=st.integers(0, 50_000),
+    ground=st.integers(0, 20_000),
+)
+def test_the_shares_of_a_budget_stay_within_it(
+    budget: int, found: int, sky: int, dense: int, ground: int
+) -> None:
+    shares = InitialBudget(budget)
+    taken = [shares.sky(sky)]
+    taken.append(shares.sfm(found, taken[0]))
+    taken.append(shares.further(dense, sum(taken)))
+    taken.append(shares.further(ground, sum(taken)))
+    assert min(taken) >= 0
+    assert taken[1] >= 1
+    assert sum(taken) <= budget
+    assert sum(taken) < budget or budget <= 2, "room for densification stays"
+
+
+@pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
+@settings(deadline=None, max_examples=20)
+@given(budget=st.integers(1, 3000), method=st.sampled_from(sorted(METHODS)))
+def test_no_method_starts_with_more_gaussians_than_its_budget(budget: int, method: str) -> None:
+    kind = METHODS[method]
+    config = kind.initial(kind.Config())
+    initial = initial_gaussians(bare_scene(2000), config, budget)
+    assert 1 <= len(initial.colors) <= budget
+    assert all(len(values) == len(initial.colors) for values in initial.rows.values())
+
+
+def test_a_budget_that_suffices_changes_nothing() -> None:
+    scene = bare_scene(500)
+    config = InitialConfig(sky=SkyConfig(points=100))
+    enough, plenty = (initial_gaussians(scene, config, budget) for budget in (2000, 3_000_000))
+    assert len(enough.colors) == 600
+    assert all(torch.equal(enough.rows[name], values) for name, values in plenty.rows.items())
+
+
+def test_points_beyond_the_budget_are_thinned_with_a_warning() -> None:
+    with pytest.warns(WildGSWarning, match=r"500 points; training starts from 75 of them"):
+        initial = initial_gaussians(bare_scene(500), InitialConfig.sfm_only(), 100)
+    assert len(initial.points) == len(initial.colors) == 75

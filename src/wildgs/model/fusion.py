@@ -9,8 +9,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from wildgs.errors import UserError
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.precision import MixedModule
+
+COLOR_CHANNELS = 3
+MAX_SH_DEGREE = 3
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,18 @@ class FusionConfig:
     sh_degree: int = 1
     output_scale: float = 0.1
     color_transform: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that no network can have."""
+        if self.intrinsic_size < COLOR_CHANNELS:
+            raise UserError(
+                f"intrinsic_size {self.intrinsic_size}: must be {COLOR_CHANNELS} or more, since a Gaussian's first "
+                "colour is kept there"
+            )
+        if self.hidden < 1:
+            raise UserError(f"hidden {self.hidden}: must be 1 or more")
+        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise UserError(f"sh_degree {self.sh_degree}: must be between 0 and {MAX_SH_DEGREE}")
 
 
 class Fusion(MixedModule):

@@ -7,6 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from wildgs.errors import UserError
+from wildgs.model.affine import AffineGS
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import initial_gaussians
 from wildgs.model.method import Method
@@ -19,6 +20,7 @@ METHODS: dict[str, type[Method]] = {
     for method in (
         WildGS,
         VanillaGS,
+        AffineGS,
     )
 }
 """All methods; the first one is the default."""
