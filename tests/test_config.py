@@ -8,8 +8,7 @@ import pytest
 
 from wildgs.config import RunConfig, differing_entries, from_plain, to_plain, with_entries
 from wildgs.errors import UserError
-from wildgs.model.vanilla import VanillaConfig, VanillaRates
-from wildgs.model.wildgs import WildGSRates
+from wildgs.model.config import VanillaConfig, VanillaRates, WildGSRates
 
 BASE = RunConfig(Path("scene"))
 

@@ -14,11 +14,11 @@ from typing import Any, Literal
 import yaml
 import yaml.composer
 
-from wildgs.engine.trainer import TrainConfig
+from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
-from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, method_type
-from wildgs.scene import DataConfig
+from wildgs.model.registry import DEFAULT_METHOD, MethodName, config_type
+from wildgs.scene.config import DataConfig
 
 MAX_CONFIG_BYTES = 1_000_000
 
@@ -43,7 +43,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         """Fills in the method's default options, and refuses those of another method."""
-        kind = method_type(self.method).Config
+        kind = config_type(self.method)
         if self.model is None:
             object.__setattr__(self, "model", kind())
         elif not isinstance(self.model, kind):
@@ -107,11 +107,11 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     if kind is RunConfig:
         try:
-            method_type(_method_of(value))
+            config_type(_method_of(value))
         except UserError as error:
             raise UserError(f"{where}.{error}") from error
         value = _upgraded(value)
-        hints["model"] = method_type(_method_of(value)).Config
+        hints["model"] = config_type(_method_of(value))
     known = {f.name for f in dataclasses.fields(kind)}
     if unknown := sorted(map(str, set(value) - known)):
         raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; known are {', '.join(sorted(known))}")
@@ -142,10 +142,10 @@ def _upgraded(plain: dict[str, Any]) -> dict[str, Any]:
     Learning rates of a method's own parameters were entries of `train.optimizer`, every method carried the default
     method's options, and `train.objective` repeated the mask's threshold.
     """
-    known = _entries(method_type(_method_of(plain)).Config)
+    known = _entries(config_type(_method_of(plain)))
     model = plain.get("model")
     if isinstance(model, dict):
-        foreign = _entries(METHODS[DEFAULT_METHOD].Config).keys() - known.keys()
+        foreign = _entries(config_type(DEFAULT_METHOD)).keys() - known.keys()
         plain = plain | {"model": {name: value for name, value in model.items() if name not in foreign}}
     train = plain.get("train")
     optimizer = train.get("optimizer") if isinstance(train, dict) else None

@@ -11,18 +11,17 @@ from hypothesis import strategies as st
 
 from wildgs.errors import WildGSWarning
 from wildgs.geometry.camera import Camera
+from wildgs.model.config import InitialConfig, SkyConfig
 from wildgs.model.encoder import load_encoder
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import (
     InitialBudget,
-    InitialConfig,
     ground_rows,
     initial_from_points,
     initial_gaussians,
 )
 from wildgs.model.parsing import ParsingConfig
-from wildgs.model.registry import METHODS
-from wildgs.model.sky import SkyConfig
+from wildgs.model.registry import METHODS, method_type
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.rasterize import blend
 from wildgs.scene import Alignment, Scene
@@ -97,7 +96,7 @@ def test_the_shares_of_a_budget_stay_within_it(
 @settings(deadline=None, max_examples=20)
 @given(budget=st.integers(1, 3000), method=st.sampled_from(sorted(METHODS)))
 def test_no_method_starts_with_more_gaussians_than_its_budget(budget: int, method: str) -> None:
-    kind = METHODS[method]
+    kind = method_type(method)
     config = kind.initial(kind.Config())
     initial = initial_gaussians(bare_scene(2000), config, budget)
     assert 1 <= len(initial.colors) <= budget

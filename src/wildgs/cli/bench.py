@@ -17,6 +17,7 @@ from wildgs.cli.bench_plan import (
     PHOTOTOURISM_DOWNSCALE,
     Job,
     bench_labels,
+    bench_methods,
     find_phototourism,
     make_jobs,
     parse_variant,
@@ -69,7 +70,7 @@ class Command:
     preset: Literal["phototourism"] | None = None
     """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, beside the paper's
     figures."""
-    methods: tuple[str, ...] = tuple(bench_labels())
+    methods: tuple[str, ...] = bench_methods()
     """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART)."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME:KEY=VALUE[,KEY=VALUE...], a further line of the table: Wild-GS with entries of config.yaml changed,

@@ -15,7 +15,7 @@ import yaml
 from wildgs.config import RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
-from wildgs.model.registry import DEFAULT_METHOD, METHODS
+from wildgs.model.registry import DEFAULT_METHOD, METHODS, method_type
 from wildgs.model.wildgs import Ablation
 from wildgs.presets import PRESET_NAMES, PRESETS, with_preset
 from wildgs.runs import CONFIG_FILE
@@ -27,11 +27,22 @@ _WITHOUT = "without-"
 _ABLATION_LABELS = {"reverse": "w/o {c'}"}
 
 
+def bench_methods() -> tuple[str, ...]:
+    """Everything the bench can run: methods, presets, and the paper's ablations."""
+    return (
+        *(name for name in METHODS if name != DEFAULT_METHOD),
+        DEFAULT_METHOD + _HALF,
+        DEFAULT_METHOD,
+        *(name for name in PRESET_NAMES if name != "default"),
+        *(_WITHOUT + part for part in get_args(Ablation)),
+    )
+
+
 def bench_labels() -> dict[str, str]:
-    """Everything the bench can run, and its label in the table: methods, presets, and the paper's ablations."""
-    default = METHODS[DEFAULT_METHOD]
+    """How the table calls what the bench can run."""
+    default = method_type(DEFAULT_METHOD)
     return {
-        **{name: method.label for name, method in METHODS.items() if name != DEFAULT_METHOD},
+        **{name: method_type(name).label for name in METHODS if name != DEFAULT_METHOD},
         DEFAULT_METHOD + _HALF: default.label + "†",
         DEFAULT_METHOD: default.label,
         **{name: f"preset {name}" for name in PRESET_NAMES if name != "default"},
@@ -91,7 +102,7 @@ def parse_variant(text: str) -> Variant:
         raise UserError(
             f"--variant {text}: expected NAME:KEY=VALUE, for example slow:model.learning_rates.networks=5e-4"
         )
-    if name in bench_labels():
+    if name in bench_methods():
         raise UserError(f"--variant {text}: {name} is a method of the bench; choose another name")
     entries: dict[str, Any] = {}
     for entry in _NEXT_ENTRY.split(rest):
@@ -196,8 +207,8 @@ def method_config(method: str, base: RunConfig) -> RunConfig:
     Raises:
         UserError: There is no such method.
     """
-    if method not in bench_labels():
-        raise UserError(f"--methods {method}: unknown; choose from {', '.join(bench_labels())}")
+    if method not in bench_methods():
+        raise UserError(f"--methods {method}: unknown; choose from {', '.join(bench_methods())}")
     if method in METHODS:
         return base.with_method(method)
     if method.endswith(_HALF):

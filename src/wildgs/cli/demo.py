@@ -16,7 +16,7 @@ from wildgs.engine.density import DensityConfig
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.parsing import ParsingConfig
-from wildgs.model.registry import METHODS
+from wildgs.model.registry import method_type
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import load_run
 
@@ -74,7 +74,7 @@ def run(command: Command) -> None:
             "full": evaluate_run(loaded, scene, "full"),
             "half": evaluate_run(loaded, scene, "half"),
         }
-        runs.append((METHODS[method].label, loaded, scores))
+        runs.append((method_type(method).label, loaded, scores))
     print_scores({name: scores for name, _, scores in runs})
     write_showcase(page, "Wild-GS demo", SUMMARY.format(photos=command.photos), scene, runs)
     scene_page = command.output / "scene.html"

@@ -17,7 +17,7 @@ from wildgs.engine.autosave import AutosaveConfig
 from wildgs.engine.distributed import join
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig
-from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, method_type
+from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, config_type
 from wildgs.presets import PRESET_NAMES, PresetName, with_preset
 from wildgs.runs import (
     CONFIG_FILE,
@@ -72,7 +72,7 @@ def command_for(arguments: list[str]) -> type[Command]:
     fields = [
         ("data", Annotated[DataConfig, unnamed], field(default=config.data)),
         ("method", method, field(default=found.method)),
-        ("model", Annotated[method_type(found.method).Config, unnamed], field(default=config.model)),
+        ("model", Annotated[config_type(found.method), unnamed], field(default=config.model)),
         ("train", Annotated[TrainConfig, unnamed], field(default=config.train)),
     ]
     return make_dataclass("Command", fields, bases=(Command,), frozen=True)

@@ -4,47 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from wildgs.engine.config import OptimizerConfig
 from wildgs.engine.schedule import exponential
 from wildgs.geometry.morton import morton_order
+from wildgs.model.config import LearningRate
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.method import LearningRate, Method
+from wildgs.model.method import Method
 
 
-@dataclass(frozen=True)
-class OptimizerConfig:
-    """Learning rates of the geometry, 3DGS's; a method has those of its own parameters (`model.learning_rates`).
-
-    Attributes:
-        means: Position, at the start, per unit of scene extent.
-        means_final: Position, at the end, per unit of scene extent.
-        scales: Logarithms of the scales.
-        quats: Orientations.
-        opacities: Opacity logits.
-        batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
-            rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
-    """
-
-    means: float = 1.6e-4
-    means_final: float = 1.6e-6
-    scales: float = 5e-3
-    quats: float = 1e-3
-    opacities: float = 5e-2
-    batch_scaling: Literal["sqrt", "none"] = "sqrt"
-
-    def geometry(self, extent: float) -> dict[str, LearningRate]:
-        """Rates of the rows that every method has; `extent` scales positions."""
-        return {
-            "means": LearningRate(self.means * extent, self.means_final / self.means),
-            "quats": LearningRate(self.quats),
-            "log_scales": LearningRate(self.scales),
-            "opacity_logits": LearningRate(self.opacities),
-        }
+def geometry_rates(config: OptimizerConfig, extent: float) -> dict[str, LearningRate]:
+    """Learning rates of the rows that every method has; `extent` scales positions."""
+    return {
+        "means": LearningRate(config.means * extent, config.means_final / config.means),
+        "quats": LearningRate(config.quats),
+        "log_scales": LearningRate(config.scales),
+        "opacity_logits": LearningRate(config.opacities),
+    }
 
 
 @dataclass
@@ -79,7 +59,7 @@ class Optimizers:
         """
         scaled = photos if config.batch_scaling == "sqrt" else 1
         rate, betas = scaled**0.5, (0.9**scaled, 0.999**scaled)
-        row_rates = config.geometry(extent) | method.row_rates()
+        row_rates = geometry_rates(config, extent) | method.row_rates()
         groups = [
             {"params": [parameter], "name": name, "lr": rate * row_rates[name].start}
             for name, parameter in method.gaussians.rows.items()

@@ -2,8 +2,8 @@
 
 Every training photo has a learnt embedding, and so has every Gaussian. A small network reads both, and the
 Gaussian's flat colour, and gives a scale and an offset for the Gaussian's colours, as WildGaussians do; gsplat's
-appearance option is alike, with an offset alone. A photo that did not train gets the embedding under which the scene,
-as it is, looks most like it: a few steps of gradient descent, as in NeRF-W and WildGaussians.
+appearance option is alike, with an offset alone. A photo that did not train gets the embedding under which the
+scene, as it is, looks most like it: a few steps of gradient descent, as in NeRF-W and WildGaussians.
 
 Neither masks nor depth are part of this method.
 """
@@ -25,11 +25,11 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.losses.photometric import masked_photometric
 from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.config import InitialConfig, LearningRate
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.initial import InitialConfig, InitialGaussians
+from wildgs.model.initial import InitialGaussians
 from wildgs.model.method import (
     GEOMETRY_ROWS,
-    LearningRate,
     MemoryUse,
     Method,
     ParameterGroup,

@@ -2,51 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from wildgs.errors import UserError
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.model.config import FusionConfig
 from wildgs.model.precision import MixedModule
 
 COLOR_CHANNELS = 3
 MAX_SH_DEGREE = 3
-
-
-@dataclass(frozen=True)
-class FusionConfig:
-    """The fusion network.
-
-    Attributes:
-        intrinsic_size: Length of the intrinsic feature (paper: 32).
-        hidden: Width of the two hidden layers.
-        sh_degree: Degree of the predicted spherical harmonics (paper: 3, as 3DGS has).
-        output_scale: Factor on the output layer's initial weights.
-        color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
-            exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
-    """
-
-    intrinsic_size: int = 32
-    hidden: int = 64
-    sh_degree: int = 1
-    output_scale: float = 0.1
-    color_transform: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuses sizes that no network can have."""
-        if self.intrinsic_size < COLOR_CHANNELS:
-            raise UserError(
-                f"intrinsic_size {self.intrinsic_size}: must be {COLOR_CHANNELS} or more, since a Gaussian's first "
-                "colour is kept there"
-            )
-        if self.hidden < 1:
-            raise UserError(f"hidden {self.hidden}: must be 1 or more")
-        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
-            raise UserError(f"sh_degree {self.sh_degree}: must be between 0 and {MAX_SH_DEGREE}")
 
 
 class Fusion(MixedModule):

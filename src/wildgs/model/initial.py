@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.errors import WildGSWarning
+from wildgs.model.config import InitialConfig, SkyConfig
 from wildgs.model.gaussians import colors_to_unit, geometry_from_points
 from wildgs.model.sky import COLOR as SKY_COLOR
-from wildgs.model.sky import SkyConfig, sky_points
-from wildgs.priors.depth_points import DepthPointsConfig, depth_points
-from wildgs.priors.ground import GroundConfig, ground_points
+from wildgs.model.sky import sky_points
+from wildgs.priors.depth_points import depth_points
+from wildgs.priors.ground import ground_points
 from wildgs.scene import Scene
 
 ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
@@ -24,26 +25,6 @@ ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
 GROUND_WIDTH, GROUND_THICKNESS = 0.6, 0.1
 """Standard deviations along and across the ground, in units of the spacing: neighbours overlap."""
 GROUND_OPACITY = 0.7
-
-
-@dataclass(frozen=True)
-class InitialConfig:
-    """Gaussians at the start beside those on SfM points. None of them is in the paper.
-
-    Attributes:
-        depth_points: On surfaces that depth priors show and SfM has no points of.
-        ground: That continue the ground.
-        sky: That stand for the sky.
-    """
-
-    depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
-    ground: GroundConfig = field(default_factory=GroundConfig)
-    sky: SkyConfig = field(default_factory=SkyConfig)
-
-    @classmethod
-    def sfm_only(cls) -> InitialConfig:
-        """SfM points alone, as 3DGS starts."""
-        return cls(DepthPointsConfig(points=0), GroundConfig(points=0), SkyConfig(points=0))
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, mean_embeddings
+from wildgs.model.config import InitialConfig, LearningRate
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.initial import InitialConfig, InitialGaussians, initial_from_points
+from wildgs.model.initial import InitialGaussians, initial_from_points
 from wildgs.model.rows import rows_to_shade, take_rows
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
 
@@ -61,19 +62,6 @@ class TrainingOutput:
     rendering: Rendering
     projection: Projection
     visibility: Float[Tensor, "H W"] | None
-
-
-@dataclass(frozen=True)
-class LearningRate:
-    """A learning rate that decays exponentially.
-
-    Attributes:
-        start: At the first step.
-        decay: Factor reached at the last step; 1 keeps the rate constant.
-    """
-
-    start: float
-    decay: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager
-from typing import Literal
 
 import torch
 from torch import nn
 
+from wildgs.model.config import Precision
 from wildgs.model.replays import Replays
-
-Precision = Literal["auto", "float32", "bfloat16"]
 
 # oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024 by itself. A collection
 # of photos of many sizes needs more: two thirds of every step went into compiling again. Read at the first of them.

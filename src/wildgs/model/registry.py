@@ -1,27 +1,40 @@
-"""Methods by name. A new method is a file of its own and one line here."""
+"""Methods by name. A new method is a file of its own and one line here.
+
+Classes are imported when they are first asked for, so that the command line can list methods without torch.
+"""
 
 from __future__ import annotations
 
-from typing import Any
-
-from torch import Tensor
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from wildgs.errors import UserError
-from wildgs.model.affine import AffineGS
-from wildgs.model.gaussians import Gaussians
-from wildgs.model.initial import initial_gaussians
-from wildgs.model.method import Method
-from wildgs.model.vanilla import VanillaGS
-from wildgs.model.wildgs import WildGS
-from wildgs.scene import Scene
 
-METHODS: dict[str, type[Method]] = {
-    method.name: method
-    for method in (
-        WildGS,
-        VanillaGS,
-        AffineGS,
-    )
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from wildgs.model.method import Method
+    from wildgs.scene import Scene
+
+
+@dataclass(frozen=True)
+class Registered:
+    """Where a method is, as ``module:name`` within this package.
+
+    Attributes:
+        method: The class.
+        config: Its configuration, where that can be imported without torch; None takes the class's own.
+    """
+
+    method: str
+    config: str | None = None
+
+
+METHODS: dict[str, Registered] = {
+    "wildgs": Registered("wildgs.model.wildgs:WildGS", "wildgs.model.config:WildGSConfig"),
+    "3dgs": Registered("wildgs.model.vanilla:VanillaGS", "wildgs.model.config:VanillaConfig"),
+    "affine": Registered("wildgs.model.affine:AffineGS"),
 }
 """All methods; the first one is the default."""
 
@@ -31,15 +44,34 @@ MethodName = str
 _ROWS = "gaussians.rows."
 
 
+def _find(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+def _registered(name: MethodName) -> Registered:
+    if name not in METHODS:
+        raise UserError(f"method {name!r}: unknown; choose one of {', '.join(METHODS)}")
+    return METHODS[name]
+
+
 def method_type(name: MethodName) -> type[Method]:
     """The class of a method.
 
     Raises:
         UserError: There is no such method.
     """
-    if name not in METHODS:
-        raise UserError(f"method {name!r}: unknown; choose one of {', '.join(METHODS)}")
-    return METHODS[name]
+    return _find(_registered(name).method)
+
+
+def config_type(name: MethodName) -> type:
+    """The dataclass of a method's options.
+
+    Raises:
+        UserError: There is no such method.
+    """
+    place = _registered(name).config
+    return method_type(name).Config if place is None else _find(place)
 
 
 def create_method(
@@ -54,6 +86,8 @@ def create_method(
         max_gaussians: Bound on their number.
         seed: Of random choices among points.
     """
+    from wildgs.model.initial import initial_gaussians
+
     method = method_type(name)
     config = method.Config() if config is None else config
     return method.create(config, initial_gaussians(scene, method.initial(config), max_gaussians, seed))
@@ -65,6 +99,8 @@ def restore_method(name: MethodName, config: Any, state: dict[str, Tensor]) -> M
     Raises:
         UserError: The tensors do not belong to this method and configuration.
     """
+    from wildgs.model.gaussians import Gaussians
+
     try:
         rows = {key.removeprefix(_ROWS): value for key, value in state.items() if key.startswith(_ROWS)}
         _check_rows(rows, method_type(name).rows(config))

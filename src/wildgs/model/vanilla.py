@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
@@ -13,11 +12,11 @@ from torch import Tensor
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.config import LearningRate, VanillaConfig
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians
 from wildgs.model.method import (
     GEOMETRY_ROWS,
-    LearningRate,
     MemoryUse,
     Method,
     Stage,
@@ -28,30 +27,6 @@ from wildgs.model.rows import take_rows
 from wildgs.rasterize import blend
 
 SH_DEGREE = 3
-
-
-@dataclass(frozen=True)
-class VanillaRates:
-    """Learning rates of the harmonics; values are 3DGS's.
-
-    Attributes:
-        sh0: Flat colour.
-        shN: Higher harmonics.
-    """
-
-    sh0: float = 2.5e-3
-    shN: float = 1.25e-4  # noqa: N815 - the field's name
-
-
-@dataclass(frozen=True)
-class VanillaConfig:
-    """Plain 3D Gaussian Splatting.
-
-    Attributes:
-        learning_rates: Of the harmonics.
-    """
-
-    learning_rates: VanillaRates = field(default_factory=VanillaRates)
 
 
 class VanillaGS(Method):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,14 +13,14 @@ from torch import Tensor
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.color_match import match_colors
+from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
 from wildgs.model.encoder import Encoder, load_encoder
-from wildgs.model.fusion import Fusion, FusionConfig
+from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.initial import InitialConfig, InitialGaussians
+from wildgs.model.initial import InitialGaussians
 from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.method import (
     GEOMETRY_ROWS,
-    LearningRate,
     MemoryUse,
     Method,
     ParameterGroup,
@@ -28,65 +28,11 @@ from wildgs.model.method import (
     TrainingOutput,
     paint_visible,
 )
-from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.parsing import Parsing
 from wildgs.model.rows import take_rows
-from wildgs.model.sky import SkyConfig
 from wildgs.model.triplane import Box, robust_box
-from wildgs.model.wrapping import Wrapping, WrappingConfig
-from wildgs.priors.depth_points import DepthPointsConfig
-from wildgs.priors.ground import GroundConfig
+from wildgs.model.wrapping import Wrapping
 from wildgs.rasterize import Projection, blend
-
-Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
-"""Parts that can be left out: the paper's five ablations, and the intrinsic and local features."""
-
-
-@dataclass(frozen=True)
-class WildGSRates:
-    """Learning rates of what plain 3DGS does not have.
-
-    Attributes:
-        intrinsic: Intrinsic features, at the start.
-        networks: All networks but the encoder, at the start.
-        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
-            thousand steps, and the embedding of every photo becomes the same.
-        decay: Factor that all three reach at the end, exponentially.
-    """
-
-    intrinsic: float = 2.5e-3
-    networks: float = 1e-3
-    encoder: float = 1e-4
-    decay: float = 0.1
-
-
-@dataclass(frozen=True)
-class WildGSConfig:
-    """Wild-GS.
-
-    Attributes:
-        without: Parts left out, for ablations.
-        mask_threshold: Th: pixels above it are static (lifting, depth loss).
-        parsing: 2D Parsing.
-        wrapping: 3D Wrapping.
-        fusion: The fusion network.
-        depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.
-        ground: Gaussians that continue the ground at the start.
-        sky: Gaussians that stand for the sky at the start.
-        color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
-            scene's colours under that are from the photo's. Not in the paper.
-        learning_rates: Of networks and intrinsic features.
-    """
-
-    without: tuple[Ablation, ...] = ()
-    mask_threshold: float = 0.5
-    parsing: ParsingConfig = field(default_factory=ParsingConfig)
-    wrapping: WrappingConfig = field(default_factory=WrappingConfig)
-    fusion: FusionConfig = field(default_factory=FusionConfig)
-    depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
-    ground: GroundConfig = field(default_factory=GroundConfig)
-    sky: SkyConfig = field(default_factory=SkyConfig)
-    color_match: bool = True
-    learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
 
 class WildGS(Method):
