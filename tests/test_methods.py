@@ -200,7 +200,9 @@ def test_declared_memory_holds_what_a_step_holds(trained: Trainer, scene: Scene)
     photo = view.read_photo().float() / 255
     before = trained.method.training
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-        output = method.train().training_pass(photo, view.camera, Stage(sh_degree=method.sh_degree), name=view.name)
+        output = method.train().training_pass(
+            photo, view.camera, Stage(sh_degree=method.sh_degree), name=view.name
+        )
     method.train(before)
     assert output.rendering.colors.isfinite().all()
     rows = sum(4 * values[0].numel() for values in method.gaussians.rows.values())

@@ -67,11 +67,14 @@ class DensityConfig:
             device coordinates).
         split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
         prune_opacity: Fainter Gaussians go.
-        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before. Beyond
-            the extent it is a share of their distance from the middle: what is far may be as large.
+        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
+        prune_by_distance: Whether, beyond the extent, that is a share of their distance from the middle: what is
+            far may be as large. Not in 3DGS.
         prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
-            of them float right before a camera and stand for what stood in its way.
+            of them float right before a camera and stand for what stood in its way; 0 = none. Not in 3DGS.
         reset_opacity: Opacities are lowered to this at a reset.
+        reset_unseen: Whether resets also lower those of Gaussians that no photo has shown yet, as 3DGS does: no
+            photo would raise them again.
         max_gaussians: Upper bound on the number of Gaussians, from the start.
     """
 
@@ -79,8 +82,10 @@ class DensityConfig:
     split_scale: float = 0.01
     prune_opacity: float = 0.005
     prune_scale: float = 0.1
+    prune_by_distance: bool = True
     prune_reach: float = 0.15
     reset_opacity: float = 0.01
+    reset_unseen: bool = False
     max_gaussians: int = 3_000_000
 
 

@@ -71,7 +71,7 @@ def total_loss(
     """
     if visibility is not None and not train_mask:
         visibility = visibility.detach()
-    image = masked_photometric(photo, render, _kept(visibility, keep, photo), config.weight_l1)
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo))
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
@@ -86,6 +86,14 @@ def total_loss(
         depth_term = depth_correlation(depth, disparity, selection)
         total = total + config.depth_weight * depth_term
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
+
+
+def _image_loss(config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None) -> Tensor:
+    """L^I; its gradient to the mask is the formula's or the evidence, as configured."""
+    if mask is None or config.mask_gradient == "evidence":
+        return masked_photometric(photo, render, mask, config.weight_l1)
+    mask = mask[..., None]
+    return masked_photometric(photo * mask, render * mask, None, config.weight_l1)
 
 
 def _kept(visibility: Tensor | None, keep: Tensor | None, photo: Tensor) -> Tensor | None:

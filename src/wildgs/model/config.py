@@ -27,6 +27,8 @@ class ParsingConfig:
             what five stages leave of a photo says little of its colour cast.
         global_size: Length of the global embedding (paper: 16).
         decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
+        bounded_logits: Whether M stays where its sigmoid passes a gradient, so that masks which closed or opened
+            everywhere can come back. Not in the paper.
     """
 
     encoder: str = RESNET18
@@ -34,6 +36,7 @@ class ParsingConfig:
     color_statistics: bool = True
     global_size: int = 16
     decoder_widths: tuple[int, int, int] = (128, 64, 32)
+    bounded_logits: bool = True
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ class FusionConfig:
         output_scale: Factor on the output layer's initial weights.
         color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
             exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
+        direct_path: Whether a linear path from the intrinsic feature to the output runs beside the hidden layers:
+            training then begins at the points' colours. Not in the paper.
     """
 
     intrinsic_size: int = 32
@@ -79,6 +84,7 @@ class FusionConfig:
     sh_degree: int = 1
     output_scale: float = 0.1
     color_transform: bool = True
+    direct_path: bool = True
 
     def __post_init__(self) -> None:
         """Refuses sizes that no network can have."""
