@@ -75,6 +75,7 @@ def _measure(command: Command, count: int, side: int) -> int:
 
 
 def _train_in_memory(command: Command, count: int, side: int) -> int:
+    import numpy as np
     import torch
 
     from wildgs.engine.checkpoint import save_checkpoint
@@ -83,22 +84,21 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
     from wildgs.geometry.camera import Camera
     from wildgs.model.registry import method_type
     from wildgs.scene import Alignment, Scene, View
+    from wildgs.scene.images import Photo
+    from wildgs.scene.photo_store import MemoryPhotos
 
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=generator) - torch.tensor([0.5, 0.5, -1.0])
     colors = torch.full((count, 3), 128, dtype=torch.uint8)
-    photo = torch.full((side, side, 3), 100, dtype=torch.uint8)
+    photo = Photo(np.full((side, side, 3), 100, dtype=np.uint8))
+    photos = MemoryPhotos({f"{index}.jpg": photo for index in range(2)})
     K = torch.tensor([[0.8 * side, 0, side / 2], [0, 0.8 * side, side / 2], [0, 0, 1]])
     views = tuple(
         View(
             name=f"{index}.jpg",
             camera=Camera(torch.eye(4), K, side, side),
             split="train",
-            read_photo=lambda: photo,
-            read_mask=lambda: None,
-            read_disparity=lambda: None,
-            read_clean=lambda: None,
-            read_truth_mask=lambda: None,
+            photos=photos,
         )
         for index in range(2)
     )

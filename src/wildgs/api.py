@@ -8,13 +8,13 @@ image = scene.render(scene.views[0].camera, look)
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
 from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from wildgs.errors import UserError
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
 from wildgs.light.look import Look
@@ -42,10 +42,10 @@ class LoadedScene:
         self.run = run
         self._sources = LightSources(run.method, lambda: self.scene, run.folder / LANDMARK_FILE)
 
-    @cached_property
+    @property
     def scene(self) -> Scene:
-        """The photo collection, read when first asked for; photos are decoded one by one as they are needed."""
-        return self.run.load_scene(lazy=True)
+        """The photo collection as the run folder carries it, see `Run.scene`; photos are decoded as needed."""
+        return self.run.scene
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -89,8 +89,13 @@ class LoadedScene:
         Args:
             camera: In the scene's aligned frame, as `views` have theirs.
             look: From `appearance` or `mix`.
+
+        Raises:
+            UserError: The look belongs to another run.
         """
         method = self.run.method
+        if look.method is not method:
+            raise UserError(f"the appearance {look.name!r} belongs to another run; get it from this one")
         camera = camera.to(self.gaussians.means.device)
         projection = self.gaussians.project(camera)
         colors = sh_to_colors(

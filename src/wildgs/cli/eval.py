@@ -37,7 +37,7 @@ def run(command: Command) -> None:
     """Scores and prints a table."""
     loaded = load_run(command.run)
     with counting("reading photos") as progress:
-        scene = loaded.load_scene(progress)
+        scene = loaded.read_scene(progress=progress)
     protocols: tuple[Protocol, ...] = ("full", "half") if command.protocol == "both" else (command.protocol,)
     scores: dict[Protocol, dict[str, Any]] = {
         protocol: evaluate_run(loaded, scene, protocol, lpips_folder=command.lpips) for protocol in protocols

@@ -168,7 +168,7 @@ class Trainer:
         return StepReport(self.step, view, losses, output, count, density, self.seconds, fault, taken)
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
-        photo, keep = self.feed.photo(view), self.feed.keep(view)
+        photo, keep = self.feed.photo(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
@@ -215,7 +215,7 @@ class Trainer:
         sort_rows(self.method.gaussians, self.optimizers.rows)
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
-        self.method.prepare([self.feed.photo(view) for view in chosen])
+        self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to go on exactly, as flat tensors."""

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import is_file
 from wildgs.light.atlas import Atlas, make_atlas
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
 from wildgs.light.photos import encode_photo, encode_picture, encode_view
@@ -52,7 +53,7 @@ class LightSources:
         self._open_scene = open_scene
         self._landmark_cache = landmark_cache
         self._landmarks: FeatureIndex | None = None
-        self._kept: OrderedDict[tuple[str, str | None], Look] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, str | None, tuple[int, ...]], Look] = OrderedDict()
         self._atlas: Atlas | None = None
 
     @cached_property
@@ -85,7 +86,7 @@ class LightSources:
                 message = f"{self.method.label} cannot be relit; the appearance {spec} is ignored"
                 warnings.warn(message, WildGSWarning, stacklevel=2)
             return self._own
-        key = (str(spec), like)
+        key = (str(spec), like, _stamp(Path(spec)))
         if key not in self._kept:
             self._kept[key] = self._make(str(spec), like, progress or _silent)
         self._kept.move_to_end(key)
@@ -103,9 +104,9 @@ class LightSources:
         if view is not None:
             return look_of(self.method, encode_view(self.method, view), view.name)
         file = Path(spec)
-        if not file.is_file():
+        if not is_file(file):
             raise UserError(
-                f"{spec}: is neither a photo of {self.scene.root} (names are as in its images/ folder), nor a file,"
+                f"{spec}: is neither a photo of the scene (names are as in its images/ folder), nor a file,"
                 f" nor {NEUTRAL!r}"
             )
         if like is None:
@@ -128,12 +129,12 @@ class LightSources:
         """The look of a new photo of the place."""
         if self._landmarks is None:
             self._landmarks = load_feature_index(
-                self.scene.root,
+                self.scene,
                 self._landmark_cache,
                 lambda done, total: progress("finding features of the scene's photos", done, total),
             )
         long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
-        found = localize(file, self._landmarks, self.scene.alignment, long_side)
+        found = localize(file, self._landmarks, long_side)
         appearance = encode_photo(self.method, found.photo, found.camera)
         return look_of(self.method, appearance, file.name, found.describe())
 
@@ -171,6 +172,14 @@ def read_picture(file: Path) -> UInt8[Tensor, "H W 3"]:
         return torch.from_numpy(read_photo(file).pixels)
     except UnreadableImageError as error:
         raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
+
+
+def _stamp(file: Path) -> tuple[int, ...]:
+    """What changes when a file is written again; empty where there is no file."""
+    if not is_file(file):
+        return ()
+    state = file.stat()
+    return state.st_mtime_ns, state.st_size, state.st_ino
 
 
 def _silent(*_: object) -> None:

@@ -74,13 +74,10 @@ class Subject:
         """
         return self._find_look(spec if self.relightable else NEUTRAL, like=like)
 
-    def _photo(self, view: View) -> Float[Tensor, "H W 3"]:
-        return view.read_photo().to(self.device).float() / 255
-
     @torch.no_grad()
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
         """M of a photo (1 = static), in main memory; None for a method that predicts no mask."""
-        visibility = self.method.visibility(self._photo(view))
+        visibility = self.method.visibility(view.load(self.device)[0])
         return None if visibility is None else visibility.float().cpu()
 
     @torch.no_grad()
@@ -134,8 +131,8 @@ class TrainingSubject(Subject):
                 return super().look(spec, like)
             view = match_view(self.views, str(spec)) or match_view(self.views, like or "") or self.views[0]
             with torch.no_grad():
-                camera = view.camera.to(self.device)
-                appearance = self.method.encode(self._photo(view), camera, name=view.name, explicit=False)
+                photo, camera = view.load(self.device)[0], view.camera.to(self.device)
+                appearance = self.method.encode(photo, camera, name=view.name, explicit=False)
                 return look_of(self.method, appearance, view.name)
 
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,23 @@ import filelock
 import torch
 
 from wildgs.config import RunConfig, read_config, to_plain, write_config
-from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
+from wildgs.engine.checkpoint import (
+    Checkpoint,
+    list_checkpoints,
+    load_newest,
+    save_checkpoint,
+)
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
+from wildgs.runs.scenes import CHECKPOINT_FOLDER, adopt_scene, carried_record, require_same_scene
 from wildgs.scene import Alignment, Scene, load_scene
+from wildgs.scene.carried import SCENE_FILE, Progress, carry_scene, read_carried_scene
+from wildgs.scene.scene_record import SceneRecord
 
 CONFIG_FILE = "config.yaml"
-CHECKPOINT_FOLDER = "checkpoints"
 LOCK_FILE = ".lock"
 
 
@@ -51,9 +59,50 @@ class Run:
     train_seconds: float
     alignment: Alignment
 
-    def load_scene(self, progress: Callable[[int, int], None] | None = None, *, lazy: bool = False) -> Scene:
-        """The scene on which the run was trained; `lazy` decodes photos only when they are asked for."""
-        return load_scene(self.config.scene, self.config.data, lazy=lazy, progress=progress)
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene as the run folder carries it: cameras, points, alignment, split, and photos on demand.
+
+        Its photos are copies, as large as their cameras but of no more detail than `CarriedPhotos.detail`: enough
+        to read their light and to show them, not to score against or to train on (`read_scene` is for that). Runs
+        of earlier versions carry no scene; theirs is read from the scene folder.
+
+        Raises:
+            UserError: What the run carries cannot be read; or it carries nothing, and its scene folder is gone.
+        """
+        carried = read_carried_scene(self.folder)
+        if carried is not None:
+            return carried
+        root = self._scene_folder(None)
+        return load_scene(root, self.config.data, alignment=self.alignment, lazy=True)
+
+    def read_scene(self, root: Path | None = None, progress: Progress | None = None) -> Scene:
+        """The scene with its full photos, masks, depth priors and truth, from its folder.
+
+        Cameras, split, points and alignment are the run's own, so that a scene folder that changed since changes no
+        score silently: one warning says what differs.
+
+        Args:
+            root: The scene folder; None takes the one on which the run was trained.
+            progress: Called with (photos read, photos in all).
+
+        Raises:
+            UserError: The folder is missing, cannot be read, or holds another scene.
+        """
+        root = self._scene_folder(root)
+        found = load_scene(root, self.config.data, alignment=self.alignment, progress=progress)
+        if not (self.folder / SCENE_FILE).is_file():
+            return found
+        return adopt_scene(SceneRecord.read(self.folder / SCENE_FILE), found, self.folder)
+
+    def _scene_folder(self, root: Path | None) -> Path:
+        root = root or self.config.scene
+        if not root.is_dir():
+            raise UserError(
+                f"{root}: no such folder; {self.folder} was trained on the photos there: "
+                "give the folder where they are now by --scene"
+            )
+        return root
 
 
 def load_run(folder: Path, device: torch.device | None = None) -> Run:
@@ -141,22 +190,37 @@ def refuse_trained(folder: Path) -> None:
 
 
 def prepare_training(
-    folder: Path, config: RunConfig, scene: Scene, *, resume: bool, team: Team | None = None
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    *,
+    resume: bool,
+    team: Team | None = None,
+    progress: Progress | None = None,
 ) -> Trainer:
     """A trainer at step 0, or at the newest whole checkpoint of a run that may have a lower budget now.
 
     Of several processes, rank 0 alone reads and writes the run folder.
 
+    Args:
+        folder: The run folder.
+        config: Of the run.
+        scene: What is trained on.
+        resume: Whether to go on with a run.
+        team: The processes that train together.
+        progress: Called with (photos, photos in all) while the run folder gets its copies of the photos.
+
     Raises:
         UserError: As `start_training` and `resume_training` do.
     """
     if not resume:
-        return start_training(folder, config, scene, team=team)
+        return start_training(folder, config, scene, team=team, progress=progress)
     team = team or Team()
+    team.from_first(lambda: require_same_scene(folder, scene))
     stored = team.from_first(lambda: read_config(folder / CONFIG_FILE))
     if config != stored:
         team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
-    trainer = resume_training(folder, scene, team=team)
+    trainer = resume_training(folder, scene, team=team, progress=progress)
     if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
         # Saved at once, so that a run killed from here on goes on from this very state.
         team.from_first(lambda: save_run(folder, trainer, config, scene.alignment))
@@ -169,14 +233,15 @@ def start_training(
     scene: Scene,
     device: torch.device | None = None,
     team: Team | None = None,
+    progress: Progress | None = None,
 ) -> Trainer:
-    """A trainer at step 0; writes the run's configuration.
+    """A trainer at step 0; writes the run's configuration and what the run carries of its scene.
 
     Raises:
         UserError: The folder already holds a trained run.
     """
     team = team or Team()
-    team.from_first(lambda: _claim(folder, config))
+    team.from_first(lambda: _claim(folder, config, scene, progress))
     with team.together():
         torch.manual_seed(config.train.seed)
         budget = config.train.density.max_gaussians
@@ -186,29 +251,37 @@ def start_training(
         return Trainer(method.to(device or default_device()), scene, config.train, team)
 
 
-def _claim(folder: Path, config: RunConfig) -> None:
+def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Progress | None) -> None:
     refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
+    carry_scene(folder, scene, progress)
 
 
 def resume_training(
-    folder: Path, scene: Scene, device: torch.device | None = None, team: Team | None = None
+    folder: Path,
+    scene: Scene,
+    device: torch.device | None = None,
+    team: Team | None = None,
+    progress: Progress | None = None,
 ) -> Trainer:
-    """A trainer at the newest whole checkpoint, with the configuration that the run began with.
+    """A trainer at the newest undamaged checkpoint, with the configuration that the run began with.
 
-    A run that was killed before its first checkpoint starts at step 0 again.
+    A run that was killed before its first checkpoint starts at step 0 again. Cameras, split, points and alignment
+    are those that the run carries; a run of an earlier version carries them from now on.
 
     Raises:
-        UserError: The folder holds no run, or no checkpoint that is whole.
+        UserError: The folder holds no run, all checkpoints are damaged, or the run is of another scene.
     """
     team = team or Team()
     config = team.from_first(lambda: read_config(folder / CONFIG_FILE))
     checkpoint = team.from_first(lambda: newest_checkpoint(folder, set_aside=True))
     if checkpoint is None:
-        return start_training(folder, config, scene, device, team)
+        return start_training(folder, config, scene, device, team, progress)
+    record = team.from_first(lambda: carried_record(folder, scene, progress))
     with team.together(), _complete(folder):
         method = restore_method(config.method, config.model, checkpoint.method)
+        scene = adopt_scene(record, scene, folder)
         trainer = Trainer(method.to(device or default_device()), scene, config.train, team)
         trainer.restore(checkpoint.state)
     return trainer
