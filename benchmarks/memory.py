@@ -124,8 +124,8 @@ def _train_on_photos(command: Command) -> None:
         root = Path(name)
         width, height = _write_scene(root, command)
         read_photo(root / "images" / "000000.jpg")
-        config = DataConfig(image_cache=command.image_cache, downscale=command.downscale, holdout=0)
-        scene = load_scene(root, config, progress=_progress)
+        config = DataConfig(downscale=command.downscale, holdout=0)
+        scene = load_scene(root, config, image_cache=command.image_cache, progress=_progress)
         print(
             f"\n{len(scene.views)} photos of {width}x{height}: peak {_peak() / 2**20:.0f} MiB after reading"
         )

@@ -13,8 +13,8 @@ import torch
 import tyro
 from PIL import Image
 
-from wildgs.cli.showcase import different_lights
 from wildgs.evaluation.metrics import to_8bit
+from wildgs.library.showcase import different_lights
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import load_run

@@ -187,10 +187,11 @@ def make_trainer(
     noise = 0.02 * torch.randn(n, 3, generator=generator)
     torch.manual_seed(0)
     kind = method_type(name)
-    config = model if isinstance(model, kind.Config) else kind.Config()
-    method = kind.from_points(config, scene.points[source] + noise, scene.point_colors[source])
-    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n), cuda_graphs=graphs)
+    options = model if isinstance(model, kind.Config) else kind.Config()
+    method = kind.from_points(options, scene.points[source] + noise, scene.point_colors[source])
+    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
     trainer = Trainer(method.to(device), scene, config, team)
+    trainer.cuda_graphs = graphs
     trainer.begin()
     trainer.step = trainer.schedule.first_stage + 1
     return trainer

@@ -8,9 +8,10 @@ from typing import get_args
 
 import pytest
 
-from wildgs.cli.bench_plan import bench_labels, find_phototourism, make_jobs, method_config, parse_variant
 from wildgs.config import RunConfig, write_config
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant
+from wildgs.library.config import BENCH_METHODS
 from wildgs.model.registry import METHODS
 from wildgs.model.wildgs import Ablation
 
@@ -18,11 +19,15 @@ BASE = RunConfig(Path())
 
 
 def test_every_ablation_is_a_method_with_a_label():
-    labels = bench_labels()
-    assert labels["without-reverse"] == "w/o {c'}"
-    ablations = {name.removeprefix("without-") for name in labels if name.startswith("without-")}
+    ablations = {name.removeprefix("without-") for name in BENCH_METHODS if name.startswith("without-")}
     assert ablations == set(get_args(Ablation))
-    for name in labels:
+    assert [label_of(name) for name in ("3dgs", "wildgs-half-steps", "without-reverse", "mine")] == [
+        "3DGS",
+        "Wild-GS†",
+        "w/o {c'}",
+        "mine",
+    ]
+    for name in BENCH_METHODS:
         config = method_config(name, BASE)
         assert config.method == (name if name in METHODS else "wildgs")
         if config.method == "wildgs":
@@ -133,7 +138,7 @@ def test_preset_finds_its_scenes_in_the_papers_order(tmp_path):
 
 
 def test_preset_without_scenes_or_split_says_what_to_do(tmp_path):
-    with pytest.raises(UserError, match="none of the preset's scenes"):
+    with pytest.raises(UserError, match="none of the suite's scenes"):
         find_phototourism([tmp_path])
     (tmp_path / "sacre_coeur").mkdir()
     with (

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.errors import UserError
-from wildgs.scene import DataConfig, load_scene
+from wildgs.scene import load_scene
 from wildgs.scene.config import parse_bytes
 from wildgs.scene.image_cache import _WINDOW, AHEAD, ImageCache, available_memory
 from wildgs.scene.images import Photo
@@ -43,7 +43,7 @@ def test_other_text_is_no_size(text: str) -> None:
 
 def test_a_cache_that_is_no_size_is_refused() -> None:
     with pytest.raises(UserError, match="4GB"):
-        DataConfig(image_cache="plenty")
+        parse_bytes("plenty")
 
 
 @given(st.lists(st.integers(0, 29), max_size=80), st.integers(0, 40), st.booleans())
@@ -99,7 +99,7 @@ def test_background_threads_decode_ahead() -> None:
 
 def test_a_photo_that_vanished_is_named(make_scene: Callable[..., Path]) -> None:
     root = make_scene(3)
-    scene = load_scene(root, DataConfig(image_cache="0"), lazy=True)
+    scene = load_scene(root, lazy=True, image_cache="0")
     name = scene.views[1].name
     (root / "images" / name).unlink()
     scene.views[1].prefetch()
@@ -110,7 +110,7 @@ def test_a_photo_that_vanished_is_named(make_scene: Callable[..., Path]) -> None
 
 def test_a_scene_reads_the_same_through_the_smallest_cache(make_scene: Callable[..., Path]) -> None:
     root = make_scene(12)
-    large, small = load_scene(root), load_scene(root, DataConfig(image_cache="1kB"))
+    large, small = load_scene(root), load_scene(root, image_cache="1kB")
     for a, b in zip(large.views, small.views, strict=True):
         b.prefetch()
         assert torch.equal(a.read_photo(), b.read_photo())

@@ -97,7 +97,6 @@ class TrainConfig:
         steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
         seed: Random seed.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
-        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         objective: Loss weights.
         schedule: Training schedule.
         optimizer: Learning rates.
@@ -107,7 +106,6 @@ class TrainConfig:
     steps: int = 30_000
     seed: int = 0
     precision: Precision = "auto"
-    cuda_graphs: bool = True
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

@@ -68,7 +68,11 @@ Observer = Callable[[StepReport], None]
 
 
 class Trainer:
-    """Trains a method on a scene's training photos."""
+    """Trains a method on a scene's training photos.
+
+    Attributes:
+        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+    """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
         """Sets up a `Trainer`.
@@ -105,6 +109,7 @@ class Trainer:
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device)
         self.guard = StepGuard()
+        self.cuda_graphs = True
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -138,7 +143,7 @@ class Trainer:
         self.team.share(self.method.state_dict().values())
         self._verify()
         set_precision(self.method, precision)
-        switch_replays(self.method, self.config.cuda_graphs)
+        switch_replays(self.method, self.cuda_graphs)
 
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""

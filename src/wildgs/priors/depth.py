@@ -22,12 +22,12 @@ from torch.nn.functional import interpolate
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import written_aside
 from wildgs.hub import hub_reachable
+from wildgs.priors.config import DEPTH_ANYTHING
 from wildgs.scene.colmap import read_model
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.scene.photo_store import depth_files
 
-DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 NETWORK_SIZE = 518
 """Side at which the network was trained; its 37 x 37 patches."""
 STORED_SIZE = 1036

@@ -218,7 +218,7 @@ def prepare_training(
     team = team or Team()
     team.from_first(lambda: require_same_scene(folder, scene))
     stored = team.from_first(lambda: read_config(folder / CONFIG_FILE))
-    if config != stored:
+    if to_plain(config) != to_plain(stored):  # the scene may have moved
         team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
     trainer = resume_training(folder, scene, team=team, progress=progress)
     if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():

@@ -14,7 +14,7 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
-from wildgs.scene.config import DataConfig, parse_bytes
+from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 from wildgs.scene.image_cache import DECODERS, ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.photo_store import ScenePhotos
@@ -32,6 +32,7 @@ def load_scene(
     *,
     alignment: Alignment | None = None,
     lazy: bool = False,
+    image_cache: str = IMAGE_CACHE,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Read a COLMAP scene: cameras, points, split, photos (8 bits, within `image_cache`), masks, depth.
@@ -46,6 +47,7 @@ def load_scene(
             that their Gaussians fit whatever has become of the model.
         lazy: Decode photos only when they are asked for, and keep the last few: for tools that look at some of
             them. A photo that cannot be read is then no reason to leave its view out.
+        image_cache: Memory for decoded photos, such as 4GB; without influence on what is read.
         progress: Called with (photos read, photos in all) as photos are decoded.
 
     Returns:
@@ -69,7 +71,7 @@ def load_scene(
         root,
         model.images_dir,
         names,
-        ImageCache(0 if lazy else _cache_limit(config)),
+        ImageCache(0 if lazy else _cache_limit(image_cache)),
         use_masks=config.use_masks,
         use_depth=config.use_depth,
         max_pixels=config.max_image_pixels,
@@ -146,8 +148,8 @@ def _load_views(
     return views, broken
 
 
-def _cache_limit(config: DataConfig) -> int:
-    limit, available = parse_bytes(config.image_cache), available_memory()
+def _cache_limit(image_cache: str) -> int:
+    limit, available = parse_bytes(image_cache), available_memory()
     return limit if available is None else min(limit, int(CACHE_SHARE * available))
 
 
