@@ -17,6 +17,8 @@ def test_default_changes_nothing() -> None:
 
 
 MENDED = {
+    "model.parsing.encoder": "microsoft/resnet-18",
+    "model.wrapping.resolution": 128,
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,
     "model.fusion.sh_degree": 3,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from wildgs.config import RunConfig, to_plain, with_entries
+from wildgs.model.config import RESNET18
 
 PresetName = Literal["default", "paper", "paper-mended", "fast"]
 PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
@@ -26,6 +27,8 @@ class Preset:
 
 
 _PAPER: dict[str, Any] = {
+    "model.parsing.encoder": RESNET18,
+    "model.wrapping.resolution": 128,
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,
     "model.fusion.sh_degree": 3,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.losses.depth import depth_correlation
+from wildgs.losses.evidence import proven_static
 from wildgs.losses.photometric import masked_photometric
 from wildgs.losses.visibility import visibility_regularizer
 
@@ -48,6 +49,7 @@ def total_loss(
     depth: Float[Tensor, "H W"] | None = None,
     alpha: Float[Tensor, "H W"] | None = None,
     disparity: Float[Tensor, "H W"] | None = None,
+    observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
 ) -> Losses:
@@ -63,6 +65,8 @@ def total_loss(
         depth: Rendered expected depth; the depth loss needs it and `disparity`.
         alpha: Accumulated alpha of the render; pixels below `min_alpha` are left out of the depth loss.
         disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
+        observations: Pixels (x, y) at which the photo shows triangulated points: the mask learns that these are
+            static.
         train_mask: False passes no gradient to the mask (the pause after an opacity reset).
         mask_threshold: Th: the depth loss leaves out pixels whose M is not above it.
 
@@ -71,7 +75,8 @@ def total_loss(
     """
     if visibility is not None and not train_mask:
         visibility = visibility.detach()
-    image = _image_loss(config, photo, render, _kept(visibility, keep, photo))
+    proven = None if observations is None else proven_static(observations, *photo.shape[:2])
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
@@ -88,10 +93,12 @@ def total_loss(
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
 
 
-def _image_loss(config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None) -> Tensor:
+def _image_loss(
+    config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None, proven: Tensor | None
+) -> Tensor:
     """L^I; its gradient to the mask is the formula's or the evidence, as configured."""
     if mask is None or config.mask_gradient == "evidence":
-        return masked_photometric(photo, render, mask, config.weight_l1)
+        return masked_photometric(photo, render, mask, config.weight_l1, proven=proven)
     mask = mask[..., None]
     return masked_photometric(photo * mask, render * mask, None, config.weight_l1)
 

@@ -283,10 +283,10 @@ class Method(nn.Module, ABC):
 
         Args:
             photo: RGB in [0, 1].
-            camera: Its camera.
+            camera: Its camera, of the photo's size.
             stage: Of the training schedule.
             keep: The user's own mask: pixels that are False are not read.
-            name: The photo's name.
+            name: The photo's, by which a method may keep what it learnt or computed of it.
         """
 
     def render(

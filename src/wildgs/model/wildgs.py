@@ -14,7 +14,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.color_match import match_colors
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
-from wildgs.model.encoder import Encoder, load_encoder
+from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians
@@ -100,7 +100,7 @@ class WildGS(Method):
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
         """With a fresh encoder and any box."""
-        return cls(config, gaussians, Box(torch.zeros(3), torch.ones(3)), load_encoder(None))
+        return cls(config, gaussians, Box(torch.zeros(3), torch.ones(3)), encoder_of(state, "parsing.encoder."))
 
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
@@ -176,10 +176,17 @@ class WildGS(Method):
         return self.parse(photo).visibility
 
     def parse(
-        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True, learn_mask: bool = True
+        self,
+        photo: Float[Tensor, "H W 3"],
+        *,
+        learn_encoder: bool = True,
+        learn_mask: bool = True,
+        name: str | None = None,
     ) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""
-        visibility, embedding = self.parsing(photo, learn_encoder=learn_encoder, learn_mask=learn_mask)
+        visibility, embedding = self.parsing(
+            photo, learn_encoder=learn_encoder, learn_mask=learn_mask, name=name
+        )
         if self._lacks("global"):
             embedding = torch.zeros_like(embedding)
         return Appearance(embedding, None, None if self._lacks("mask") else visibility)
@@ -245,7 +252,9 @@ class WildGS(Method):
         name: str | None = None,
     ) -> TrainingOutput:
         """The photo is its own reference; one projection serves the depth pass and the colours."""
-        appearance = self.parse(photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask)
+        appearance = self.parse(
+            photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask, name=name
+        )
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
