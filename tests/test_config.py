@@ -8,7 +8,7 @@ import pytest
 
 from wildgs.config import RunConfig, differing_entries, from_plain, to_plain, with_entries
 from wildgs.errors import UserError
-from wildgs.model.config import VanillaConfig, VanillaRates, WildGSRates
+from wildgs.model.config import VanillaConfig, VanillaRates, WildGSRates, WrappingConfig
 
 BASE = RunConfig(Path("scene"))
 
@@ -70,3 +70,15 @@ def test_a_configuration_takes_its_own_methods_options_alone():
     assert BASE.with_method("3dgs").with_method("wildgs") == BASE
     with pytest.raises(TypeError, match="3dgs takes a VanillaConfig"):
         RunConfig(Path("scene"), "3dgs", model=BASE.model)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"resolution": 200_000}, {"resolution": 0}, {"features": 10**6}, {"widths": ()}, {"widths": (8, 10**6)},
+     {"crop_ratio": 0.0}, {"crop_ratio": float("nan")}, {"box_quantile": 0.5}, {"partial_lifts": 2.0}],
+)  # fmt: skip
+def test_planes_that_no_memory_holds_are_refused(wrong: dict) -> None:
+    """A configuration file may say 200,000 cells a side, which are 1.9 TB."""
+    (name,) = wrong
+    with pytest.raises(UserError, match=f"wrapping.{name} "):
+        WrappingConfig(**wrong)

@@ -100,7 +100,9 @@ class WildGS(Method):
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
         """With a fresh encoder and any box."""
-        return cls(config, gaussians, Box(torch.zeros(3), torch.ones(3)), encoder_of(state, "parsing.encoder."))
+        return cls(
+            config, gaussians, Box(torch.zeros(3), torch.ones(3)), encoder_of(state, "parsing.encoder.")
+        )
 
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
