@@ -8,12 +8,14 @@ from typing import get_args
 
 import pytest
 
-from wildgs.config import RunConfig, write_config
+from wildgs.config import RunConfig, differing_entries, write_config
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.evaluation.published import PHOTOTOURISM, published_figures
 from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant
-from wildgs.library.config import BENCH_METHODS
+from wildgs.library.config import BENCH_METHODS, default_bench_methods, reference_preset
 from wildgs.model.registry import METHODS
 from wildgs.model.wildgs import Ablation
+from wildgs.presets import with_preset
 
 BASE = RunConfig(Path())
 
@@ -124,6 +126,34 @@ def test_a_budget_lowered_for_memory_is_no_other_setting(landmark, tmp_path):
     write_config(job.folder / "config.yaml", lowered)
     (again,) = make_jobs([landmark], BASE, ["wildgs"], [], (0,), tmp_path)
     assert again.folder == job.folder
+
+
+def test_what_stands_beside_the_papers_figures_is_the_preset_paper(landmark: Path, tmp_path: Path):
+    variants = [parse_variant("clip:train.optimizer.means=1e-4")]
+    suite = default_bench_methods("phototourism")
+    jobs = make_jobs([landmark], BASE, suite, variants, (0,), tmp_path, reference_preset("phototourism"))
+    configs = {job.method: replace(job.config, scene=BASE.scene) for job in jobs}
+    paper = with_preset(BASE, "paper")
+    compared = {name for name in configs if published_figures(PHOTOTOURISM[0], name)}
+    assert compared == {"3dgs", "wildgs", "wildgs-half-steps"} | {
+        f"without-{part}" for part in ("crop", "reverse", "global", "mask", "depth")
+    }
+    changes = {name: differing_entries(paper, configs[name]).keys() for name in [*compared, "clip"]}
+    assert changes.pop("wildgs") == set()
+    assert changes.pop("wildgs-half-steps") == {"train.steps"}
+    assert changes.pop("clip") == {"train.optimizer.means"}
+    assert configs["3dgs"] == paper.with_method("3dgs")
+    del changes["3dgs"]
+    assert all(entries == {"model.without"} for entries in changes.values())
+    assert configs["default"] == BASE
+    assert configs["paper-mended"] == with_preset(BASE, "paper-mended")
+    assert "paper" not in configs
+
+
+def test_without_a_suite_ablations_are_those_of_the_default():
+    assert method_config("without-crop", BASE).model == replace(BASE.model, without=("crop",))
+    assert {"paper", "wildgs"} <= set(default_bench_methods(None))
+    assert "default" not in default_bench_methods(None)
 
 
 def test_preset_finds_its_scenes_in_the_papers_order(tmp_path):

@@ -15,7 +15,7 @@ from wildgs.cli.screen import OUT, console, progress_shown
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import ReportedError, UserError
-from wildgs.library.config import BENCH_METHODS, Suite
+from wildgs.library.config import Suite
 from wildgs.model.config import WildGSConfig
 from wildgs.scene.config import DataConfig
 
@@ -44,9 +44,10 @@ class Command:
     """Folder for the runs and the table."""
     suite: Suite | None = None
     """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, beside the paper's
-    figures."""
-    methods: tuple[str, ...] = BENCH_METHODS
-    """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART)."""
+    figures. Wild-GS and its ablations are then trained with the preset paper; `default` is a line of its own."""
+    methods: tuple[str, ...] | None = None
+    """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART); by
+    default all."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME:KEY=VALUE[,KEY=VALUE...], a further line of the table: Wild-GS with entries of config.yaml changed,
     as in slow:model.learning_rates.networks=5e-4. May be repeated."""

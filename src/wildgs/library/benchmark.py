@@ -34,7 +34,7 @@ from wildgs.library.benchmark_plan import (
     make_jobs,
     parse_variant,
 )
-from wildgs.library.config import BENCH_METHODS, Suite
+from wildgs.library.config import Suite, default_bench_methods, reference_preset
 from wildgs.library.evaluation import PROTOCOLS, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.training import read_scene, train
@@ -82,7 +82,7 @@ def benchmark(
     config: RunConfig | None = None,
     *,
     output: str | Path = "wildgs-bench",
-    methods: Sequence[str] = BENCH_METHODS,
+    methods: Sequence[str] | None = None,
     variants: Sequence[str] = (),
     seeds: Sequence[int] = (0, 1, 2),
     suite: Suite | None = None,
@@ -100,10 +100,11 @@ def benchmark(
         scenes: Scene folders; for a suite, the folder that holds its scenes.
         config: What all runs have in common.
         output: Folder for the runs and the table.
-        methods: Lines of the table.
+        methods: Lines of the table; None takes all.
         variants: Further lines, ``NAME:KEY=VALUE[,KEY=VALUE...]``: Wild-GS with entries of config.yaml changed.
         seeds: One run each.
-        suite: `phototourism` compares with the paper's figures on its three scenes.
+        suite: `phototourism` compares with the paper's figures on its three scenes; Wild-GS, its ablations and
+            variants are then those of the preset `paper`, and so are the training options of other methods.
         lpips: Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet.
         execution: How runs are executed.
         progress: Called during all stages of all runs.
@@ -127,6 +128,7 @@ def benchmark(
     if processes.world_size() > 1:
         settle()
     base = config or RunConfig()
+    methods = default_bench_methods(suite) if methods is None else methods
     jobs = _plan_on_all(queue, lambda: _plan(request, [Path(s) for s in scenes], base, methods, seeds))
     bench = _Bench(request, jobs)
     done = sum(map(bench.is_done, jobs))
@@ -172,7 +174,8 @@ def _plan(
         if base.data.downscale == 1:
             base = replace(base, data=replace(base.data, downscale=PHOTOTOURISM_DOWNSCALE))
     parsed = [parse_variant(text) for text in request.variants]
-    return make_jobs(scenes, base, methods, parsed, seeds, request.output)
+    reference = reference_preset(request.suite)
+    return make_jobs(scenes, base, methods, parsed, seeds, request.output, reference)
 
 
 class _Bench:
@@ -246,16 +249,18 @@ class _Bench:
         )
         output = self.request.output
         heading = f"{len(done)} of {len(self.jobs)} runs, wildgs {__version__}."
-        _write_text(output / "table.md", to_markdown(rows, heading, [*self._variants(), *_notes(scores)]))
+        _write_text(output / "table.md", to_markdown(rows, heading, self._remarks(scores)))
         _write_text(output / "table.csv", to_csv(rows))
         runs = [self._record(job) for job in done]
         write_json(output / "table.json", {"wildgs": __version__, "runs": runs, "rows": to_records(rows)})
         return rows
 
-    def _variants(self) -> list[str]:
-        return [
-            f"{name}: `{entries}`." for name, _, entries in (v.partition(":") for v in self.request.variants)
-        ]
+    def _remarks(self, scores: Sequence[Score]) -> list[str]:
+        reference = reference_preset(self.request.suite)
+        lines = [] if reference == "default" else [f"All lines but other presets: preset {reference}."]
+        for name, _, entries in (variant.partition(":") for variant in self.request.variants):
+            lines.append(f"{name}: `{entries}`.")
+        return [*lines, *_notes(scores)]
 
     def _record(self, job: Job) -> dict[str, Any]:
         scores = {

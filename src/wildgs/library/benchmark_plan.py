@@ -17,7 +17,7 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
 from wildgs.library.config import BENCH_METHODS, HALF, WITHOUT
 from wildgs.model.registry import METHODS, method_type
-from wildgs.presets import PRESETS, with_preset
+from wildgs.presets import PRESETS, PresetName, with_preset
 from wildgs.runs import CONFIG_FILE
 from wildgs.scene.colmap import find_model
 from wildgs.scene.split import find_split_file
@@ -132,6 +132,7 @@ def make_jobs(
     variants: Sequence[Variant],
     seeds: Sequence[int],
     output: Path,
+    reference: PresetName = "default",
 ) -> list[Job]:
     """All runs: scene by scene, seed by seed, so that the first seed's table is complete early.
 
@@ -139,9 +140,10 @@ def make_jobs(
         scenes: Scene folders.
         base: What all runs share; its scene and seed are replaced.
         methods: Of the bench.
-        variants: Changes of `base`.
+        variants: Changes of `base` with the preset `reference`.
         seeds: One run each.
         output: The bench's folder; runs go to OUTPUT/<scene>/<method>/seed_<n>.
+        reference: The preset that everything but the presets' own lines is trained with.
 
     Raises:
         UserError: A folder is no scene, names collide, an entry of a variant does not exist, or a run folder
@@ -151,8 +153,9 @@ def make_jobs(
     _check_unique("--variant", [variant.name for variant in variants])
     _check_unique("--methods", methods)
     _check_unique("--seeds", [str(seed) for seed in seeds])
-    configs = {method: method_config(method, base) for method in methods}
-    configs |= {v.name: with_entries(base, v.entries, f"--variant {v.name}: config") for v in variants}
+    configs = {method: method_config(method, base, reference) for method in methods}
+    changed = with_preset(base, reference)
+    configs |= {v.name: with_entries(changed, v.entries, f"--variant {v.name}: config") for v in variants}
     jobs = []
     for scene in (scene.resolve() for scene in scenes):
         find_model(scene)
@@ -186,20 +189,26 @@ def label_of(name: str) -> str:
     return name
 
 
-def method_config(method: str, base: RunConfig) -> RunConfig:
+def method_config(method: str, base: RunConfig, reference: PresetName = "default") -> RunConfig:
     """The configuration of one of the bench's methods.
+
+    Args:
+        method: One of `BENCH_METHODS`.
+        base: What all runs share.
+        reference: The preset of methods, half-length runs and ablations.
 
     Raises:
         UserError: There is no such method.
     """
-    if method in METHODS:
-        return base.with_method(method)
     if method not in BENCH_METHODS:
         raise UserError(f"--methods {method}: unknown; choose from {', '.join(BENCH_METHODS)}")
-    if method.endswith(HALF):
-        return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
     if method in PRESETS:
         return with_preset(base, method)
+    base = with_preset(base, reference)
+    if method in METHODS:
+        return base.with_method(method)
+    if method.endswith(HALF):
+        return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
     return with_entries(base, {"model.without": [*base.model.without, method.removeprefix(WITHOUT)]})
 
 

@@ -9,7 +9,7 @@ import tyro
 
 from wildgs.model.config import Ablation
 from wildgs.model.registry import DEFAULT_METHOD, METHODS
-from wildgs.presets import PRESET_NAMES
+from wildgs.presets import PRESET_NAMES, PresetName
 
 ExportFormat = Literal["html", "ply", "compressed.ply", "splat", "spz", "sog"]
 """The page, and files for other programs."""
@@ -21,10 +21,23 @@ BENCH_METHODS: tuple[str, ...] = (
     *(name for name in METHODS if name != DEFAULT_METHOD),
     DEFAULT_METHOD + HALF,
     DEFAULT_METHOD,
-    *(name for name in PRESET_NAMES if name != "default"),
+    *PRESET_NAMES,
     *(WITHOUT + part for part in get_args(Ablation)),
 )
-"""Lines of the bench's table: methods, half of the steps, presets, and the ablations of Wild-GS."""
+"""Lines that a benchmark can have: methods, half of the steps, presets, and the ablations of Wild-GS."""
+
+
+def reference_preset(suite: Suite | None) -> PresetName:
+    """The preset that `wildgs`, its half-length run and its ablations stand for in a benchmark's table.
+
+    The figures of the paper are those of the paper's own method, hence the preset `paper` for its suite.
+    """
+    return "default" if suite is None else "paper"
+
+
+def default_bench_methods(suite: Suite | None) -> tuple[str, ...]:
+    """All of `BENCH_METHODS` but the preset that `wildgs` stands for already."""
+    return tuple(name for name in BENCH_METHODS if name != reference_preset(suite))
 
 
 @dataclass(frozen=True)
