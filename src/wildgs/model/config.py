@@ -7,6 +7,8 @@ from typing import Literal
 
 from wildgs.priors.config import DepthPointsConfig, GroundConfig
 
+SQUEEZENET = "squeezenet"
+"""The encoder that ships with the package."""
 RESNET18 = "microsoft/resnet-18"
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -20,7 +22,8 @@ class ParsingConfig:
     """2D Parsing.
 
     Attributes:
-        encoder: ResNet-18's folder or hub name.
+        encoder: `squeezenet` for the frozen features that ship with the package; else a ResNet-18 that learns: its
+            folder or hub name (paper: `microsoft/resnet-18`).
         max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
             anyway, and cost grows with the square.
         color_statistics: Whether M^G also reads mean and spread of the photo's own colours. Not in the paper; but
@@ -29,7 +32,7 @@ class ParsingConfig:
         decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
     """
 
-    encoder: str = RESNET18
+    encoder: str = SQUEEZENET
     max_side: int = 256
     color_statistics: bool = True
     global_size: int = 16
@@ -52,7 +55,7 @@ class WrappingConfig:
             show get whatever light comes out.
     """
 
-    resolution: int = 128
+    resolution: int = 64
     features: int = 32
     widths: tuple[int, ...] = (16, 32, 64, 64)
     local_size: int = 16
