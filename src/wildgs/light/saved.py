@@ -16,6 +16,7 @@ from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
+from wildgs.model.color_match import SKY_COLUMNS
 from wildgs.model.method import Method
 from wildgs.model.wildgs import WildGS
 
@@ -100,7 +101,7 @@ def _fitting(method: WildGS, tensors: Mapping[str, Tensor]) -> Embeddings:
         raise ValueError("rows without embeddings")
     if bool(((rows < 0) | (rows >= count)).any()):
         raise ValueError("rows of no Gaussian")
-    if color_map.shape != (3, 4):
+    if color_map.shape not in ((3, 4), (3, 4 + SKY_COLUMNS)):
         raise ValueError("a colour map of another shape")
     if not all(bool(values.isfinite().all()) for values in (common, shared, inside, color_map)):
         raise ValueError("embeddings that are no numbers")

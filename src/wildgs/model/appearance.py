@@ -24,7 +24,7 @@ class Appearance:
     global_embedding: Float[Tensor, " G"] | None = None
     planes: Float[Tensor, "3 C R R"] | None = None
     visibility: Float[Tensor, "H W"] | None = None
-    color_map: Float[Tensor, "3 4"] | None = None
+    color_map: Float[Tensor, "3 M"] | None = None
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,13 @@ class Embeddings:
     Attributes:
         global_embedding: Emb^g.
         local_embeddings: Emb^l per Gaussian.
-        color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none.
+        color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none. Where the sky is
+            matched apart, its own change follows (`wildgs.model.color_match.match_sky`).
     """
 
     global_embedding: Float[Tensor, " G"]
     local_embeddings: Float[Tensor, "N L"]
-    color_map: Float[Tensor, "3 4"] | None = None
+    color_map: Float[Tensor, "3 M"] | None = None
 
 
 def blend_embeddings(
@@ -62,7 +63,7 @@ def blend_embeddings(
     )
 
 
-def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 4"] | None:
+def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 M"] | None:
     """Σ w [A | b], where a part without a map changes nothing."""
     present = [part.color_map for part in parts if part.color_map is not None]
     if not present:
