@@ -207,7 +207,7 @@ class Trainer:
         if self.schedule.resets(self.step, taken):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         if self.schedule.densifies(self.step, taken):
-            large = self.step > self.schedule.reset_every
+            large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )

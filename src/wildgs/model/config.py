@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from wildgs.errors import UserError
 from wildgs.priors.config import DepthPointsConfig, GroundConfig
 
 SQUEEZENET = "squeezenet"
@@ -15,6 +16,17 @@ Precision = Literal["auto", "float32", "bfloat16"]
 MethodName = Literal["wildgs", "3dgs"]
 Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
 """Parts that can be taken away: the paper's five, and the intrinsic and local features."""
+
+
+WRAPPING_RANGES = {
+    "resolution": (4, 1024),
+    "features": (1, 512),
+    "local_size": (1, 512),
+    "crop_ratio": (0.01, 1.0),
+    "box_quantile": (0.0, 0.25),
+    "partial_lifts": (0.0, 1.0),
+}
+"""Smallest and largest values; at 1024 cells a side the planes take some GB."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +74,15 @@ class WrappingConfig:
     crop_ratio: float = 0.5
     box_quantile: float = 0.005
     partial_lifts: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuses planes that no memory holds, and shares that are none."""
+        for name, (least, most) in WRAPPING_RANGES.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise UserError(f"wrapping.{name} {value}: must be from {least:g} to {most:g}")
+        if not 1 <= len(self.widths) <= 8 or not all(1 <= width <= 1024 for width in self.widths):
+            raise UserError(f"wrapping.widths {self.widths}: must be 1 to 8 numbers from 1 to 1024")
 
 
 @dataclass(frozen=True)
