@@ -157,7 +157,7 @@ def _refuse_changes(command: Command, config: RunConfig) -> None:
         )
         raise UserError(
             f"--resume continues {command.output} with its own configuration and cannot change {changes}; leave "
-            "these options out, or train anew into another --output"
+            "these options out, or start a new run in another --output"
         )
 
 
