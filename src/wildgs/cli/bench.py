@@ -31,8 +31,8 @@ SHOWN = ("output", "suite", "methods", "variant", "seeds", "lpips", "data.downsc
 class Command:
     """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
 
-    The same command goes on where it stopped and skips what is done; with more scenes, methods, variants or
-    seeds it does what is new. The table (table.md, table.csv, table.json) is written anew after every run.
+    The same command resumes where it stopped and skips finished runs; with more scenes, methods, variants or
+    seeds it runs what is new. The table (table.md, table.csv, table.json) is rewritten after every run.
     Started by torchrun, every process takes the next run that nobody has.
 
     Example: wildgs bench scenes/gate --output bench --steps 3000 --downscale 2 --methods 3dgs wildgs

@@ -26,6 +26,7 @@ from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, lock_run, prepare_training, refuse_trained, save_run
 from wildgs.scene import Scene, load_scene
 from wildgs.scene.config import parse_bytes
+from wildgs.threads import limited
 
 RETRY_SHARE = 0.8
 """Share of the Gaussians with which memory ran out that the second try may have."""
@@ -109,7 +110,7 @@ def train(
     """
     folder, execution, team = Path(output), execution or ExecutionConfig(), team or Team()
     progress = progress or silent
-    with ExitStack() as stack:
+    with limited(execution.threads), ExitStack() as stack:
         if not locked:
             team.from_first(lambda: stack.enter_context(lock_run(folder)))
         if resume == "auto":
