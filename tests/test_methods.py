@@ -34,10 +34,9 @@ from wildgs.model.method import (
     ParameterGroup,
     Stage,
     TrainingOutput,
-    paint_visible,
 )
 from wildgs.model.registry import METHODS, create_method, method_type, restore_method
-from wildgs.model.rows import take_rows
+from wildgs.model.rows import paint_visible, take_rows
 from wildgs.presets import with_preset
 from wildgs.rasterize import blend
 from wildgs.scene import Scene

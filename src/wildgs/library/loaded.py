@@ -22,7 +22,7 @@ from wildgs.light.sources import LightSources
 from wildgs.light.timeline import Timeline
 from wildgs.model.gaussians import Gaussians
 from wildgs.progress import Progress
-from wildgs.rasterize import blend, sh_to_colors
+from wildgs.rasterize import blend
 from wildgs.runs import Run, load_run
 from wildgs.scene import Scene, View
 from wildgs.scene.trajectories import make_path
@@ -97,12 +97,7 @@ class LoadedScene:
         method = self.run.method
         if look.method is not method:
             raise UserError(f"the appearance {look.name!r} belongs to another run; get it from this one")
-        camera = camera.to(self.gaussians.means.device)
-        projection = self.gaussians.project(camera)
-        colors = sh_to_colors(
-            self.gaussians.means, look.sh, camera, degree=method.sh_degree, visible=projection.visible
-        )
-        return to_8bit(blend(projection, colors, depth=False).colors).cpu()
+        return to_8bit(method.render(camera, look.sh, depth=False).colors).cpu()
 
     def frames(
         self, cameras: Sequence[Camera], looks: Look | Sequence[Look]

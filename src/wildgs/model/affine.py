@@ -35,9 +35,8 @@ from wildgs.model.method import (
     ParameterGroup,
     Stage,
     TrainingOutput,
-    paint_visible,
 )
-from wildgs.model.rows import take_rows
+from wildgs.model.rows import paint_visible, take_rows
 from wildgs.rasterize import blend
 
 FOURIER_ENTRIES = 6

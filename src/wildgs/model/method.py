@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
@@ -20,7 +19,6 @@ from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, me
 from wildgs.model.config import InitialConfig, LearningRate
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians, initial_from_points
-from wildgs.model.rows import rows_to_shade, take_rows
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
 
 GEOMETRY_ROWS: dict[str, tuple[int, ...]] = {
@@ -295,21 +293,21 @@ class Method(nn.Module, ABC):
         sh: Float[Tensor, "N K 3"],
         *,
         background: Float[Tensor, " 3"] | None = None,
+        sh_degree: int | None = None,
+        depth: bool = True,
     ) -> Rendering:
-        """Rasterises the Gaussians under shaded harmonics: plain 3D Gaussian Splatting."""
+        """Rasterises the Gaussians under shaded harmonics: plain 3D Gaussian Splatting.
+
+        Args:
+            camera: In the aligned frame; it is moved to the Gaussians' device.
+            sh: From `shade` or `fuse`.
+            background: Its colour; None is black.
+            sh_degree: Evaluated degree of the harmonics; None takes all.
+            depth: Whether the expected depth is rendered too.
+        """
+        means = self.gaussians.means
+        camera = camera.to(means.device)
         projection = self.gaussians.project(camera)
-        colors = sh_to_colors(
-            self.gaussians.means, sh, camera, degree=self.sh_degree, visible=projection.visible
-        )
-        return blend(projection, colors, background=background)
-
-
-def paint_visible(
-    method: Method, projection: Projection, appearance: Appearance, sh_degree: int
-) -> Float[Tensor, "N 3"]:
-    """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded."""
-    means = method.gaussians.means
-    rows = rows_to_shade(projection.visible)
-    sh = method.shade(appearance, rows)
-    seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
-    return torch.zeros_like(means).index_copy(0, rows, seen)
+        degree = self.sh_degree if sh_degree is None else sh_degree
+        colors = sh_to_colors(means, sh, camera, degree=degree, visible=projection.visible)
+        return blend(projection, colors, background=background, depth=depth)

@@ -8,6 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from wildgs.model.appearance import Appearance
+from wildgs.model.method import Method
+from wildgs.rasterize import Projection, sh_to_colors
+
 ROWS_STEP = 1024
 
 
@@ -31,6 +35,17 @@ def take_rows(values: Float[Tensor, "N *rest"], rows: Int[Tensor, " V"]) -> Floa
     Its gradient is then written, not added up: indexing would sort the indices on a GPU to add in a fixed order.
     """
     return _TakeRows.apply(values, rows)
+
+
+def paint_visible(
+    method: Method, projection: Projection, appearance: Appearance, sh_degree: int
+) -> Float[Tensor, "N 3"]:
+    """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded."""
+    means = method.gaussians.means
+    rows = rows_to_shade(projection.visible)
+    sh = method.shade(appearance, rows)
+    seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
+    return torch.zeros_like(means).index_copy(0, rows, seen)
 
 
 class _TakeRows(torch.autograd.Function):

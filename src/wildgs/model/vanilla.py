@@ -21,9 +21,8 @@ from wildgs.model.method import (
     Method,
     Stage,
     TrainingOutput,
-    paint_visible,
 )
-from wildgs.model.rows import take_rows
+from wildgs.model.rows import paint_visible, take_rows
 from wildgs.rasterize import blend
 
 SH_DEGREE = 3

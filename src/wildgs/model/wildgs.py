@@ -26,10 +26,9 @@ from wildgs.model.method import (
     ParameterGroup,
     Stage,
     TrainingOutput,
-    paint_visible,
 )
 from wildgs.model.parsing import Parsing
-from wildgs.model.rows import take_rows
+from wildgs.model.rows import paint_visible, take_rows
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping
 from wildgs.rasterize import Projection, blend

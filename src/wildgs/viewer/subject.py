@@ -17,7 +17,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.light.look import NEUTRAL, Look, look_of
 from wildgs.light.sources import LightSources
 from wildgs.model.method import Method
-from wildgs.rasterize import Rendering, blend, sh_to_colors
+from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, match_view
 
 
@@ -83,13 +83,7 @@ class Subject:
     @torch.no_grad()
     def render(self, camera: Camera, look: Look) -> tuple[UInt8[Tensor, "H W 3"], Rendering]:
         """A picture in main memory, and the rendering with depth and alpha from which it comes."""
-        camera = camera.to(self.device)
-        gaussians = self.method.gaussians
-        projection = gaussians.project(camera)
-        colors = sh_to_colors(
-            gaussians.means, look.sh, camera, degree=self.sh_degree, visible=projection.visible
-        )
-        rendering = blend(projection, colors)
+        rendering = self.method.render(camera, look.sh, sh_degree=self.sh_degree)
         return to_8bit(rendering.colors).cpu(), rendering
 
 
