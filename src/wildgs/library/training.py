@@ -25,6 +25,7 @@ from wildgs.library.logs import logger, run_log
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, lock_run, prepare_training, refuse_trained, save_run
 from wildgs.scene import Scene, load_scene
+from wildgs.scene.carried import describe_carried
 
 RETRY_SHARE = 0.8
 """Share of the Gaussians with which memory ran out that the second try may have."""
@@ -234,6 +235,8 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             team=job.team,
             progress=counter(job.progress, "copying photos to the run"),
         )
+        if job.team.first and not resume:
+            logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
         with ExitStack() as stack:
             if job.team.first:
