@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,7 +21,9 @@ from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
+from wildgs.model.feature_cache import FeatureCache
 from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.parsing import keep_features
 from wildgs.model.precision import (
     choose_precision,
     lay_out_channels_last,
@@ -29,8 +31,10 @@ from wildgs.model.precision import (
     switch_replays,
 )
 from wildgs.scene import Scene, View, scene_extent
+from wildgs.scene.scene import observed_pixels
 
 PREPARATION_PHOTOS = 16
+FEATURE_CACHE_BYTES = 10**9
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,7 @@ class Trainer:
 
     Attributes:
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+        feature_cache: Bytes for the features that a frozen encoder gave of training photos.
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
@@ -101,16 +106,16 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.schedule = Schedule(config.schedule, config.steps)
-        self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
         self.density = DensityControl(config.density, extent, len(method.gaussians))
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
-        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device)
+        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
         self.cuda_graphs = True
+        self.feature_cache = FEATURE_CACHE_BYTES
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -127,6 +132,7 @@ class Trainer:
         finally:
             set_precision(self.method, torch.float32)
             switch_replays(self.method, False)
+            keep_features(self.method, None)
 
     def begin(self) -> None:
         """Gets the method ready for `advance`, the same on all ranks; `run` does it by itself.
@@ -145,6 +151,7 @@ class Trainer:
         self._verify()
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
+        keep_features(self.method, FeatureCache(self.feature_cache))
 
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""
@@ -176,10 +183,10 @@ class Trainer:
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep)
+        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
-            self._objective,
+            self.config.objective,
             self.schedule.progress(self.step),
             photo,
             output.rendering.colors,
@@ -188,7 +195,9 @@ class Trainer:
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
+            observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
+            mask_threshold=self.method.mask_threshold,
         )
         return output, losses
 
@@ -198,7 +207,7 @@ class Trainer:
         if self.schedule.resets(self.step, taken):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         if self.schedule.densifies(self.step, taken):
-            large = self.step > self.schedule.reset_every
+            large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )

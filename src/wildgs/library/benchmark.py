@@ -20,21 +20,21 @@ from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
 from wildgs.evaluation.benchmark_table import to_csv, to_markdown, to_records
-from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.lpips import load_lpips
 from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
 from wildgs.files import written_aside
 from wildgs.library.benchmark_plan import (
-    LABELS,
     PHOTOTOURISM_DOWNSCALE,
     Job,
     find_phototourism,
+    label_of,
     make_jobs,
     parse_variant,
 )
-from wildgs.library.config import METHODS, BenchMethod, Suite
+from wildgs.library.config import BENCH_METHODS, Suite
 from wildgs.library.evaluation import PROTOCOLS, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.training import read_scene, train
@@ -82,7 +82,7 @@ def benchmark(
     config: RunConfig | None = None,
     *,
     output: str | Path = "wildgs-bench",
-    methods: Sequence[BenchMethod] = METHODS,
+    methods: Sequence[str] = BENCH_METHODS,
     variants: Sequence[str] = (),
     seeds: Sequence[int] = (0, 1, 2),
     suite: Suite | None = None,
@@ -104,7 +104,7 @@ def benchmark(
         variants: Further lines, ``NAME:KEY=VALUE[,KEY=VALUE...]``: Wild-GS with entries of config.yaml changed.
         seeds: One run each.
         suite: `phototourism` compares with the paper's figures on its three scenes.
-        lpips: Folder with LPIPS weights, where they are not in torch's cache.
+        lpips: Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet.
         execution: How runs are executed.
         progress: Called during all stages of all runs.
         observers: Called with a `StepReport` after every training step.
@@ -162,7 +162,7 @@ def _plan(
     request: _Request,
     scenes: Sequence[Path],
     base: RunConfig,
-    methods: Sequence[BenchMethod],
+    methods: Sequence[str],
     seeds: Sequence[int],
 ) -> list[Job]:
     if not scenes or not seeds or not (methods or request.variants):
@@ -237,7 +237,7 @@ class _Bench:
             if (metrics := read_metrics(job.folder, protocol)) is not None
         ]
         labels = dict.fromkeys([job.method for job in self.jobs])
-        names = {name: LABELS.get(name, name) for name in labels}
+        names = {name: label_of(name) for name in labels}
         published = self.request.suite is not None
         rows = summarize(
             scores,

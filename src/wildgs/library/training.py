@@ -26,6 +26,7 @@ from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, lock_run, prepare_training, refuse_trained, save_run
 from wildgs.scene import Scene, load_scene
 from wildgs.scene.carried import describe_carried
+from wildgs.scene.config import parse_bytes
 
 RETRY_SHARE = 0.8
 """Share of the Gaussians with which memory ran out that the second try may have."""
@@ -238,6 +239,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
         if job.team.first and not resume:
             logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
+        trainer.feature_cache = parse_bytes(job.execution.feature_cache)
         with ExitStack() as stack:
             if job.team.first:
                 observers = [stack.enter_context(open_one(trainer, job.scene)) for open_one in job.attach]
