@@ -25,6 +25,7 @@ from wildgs.library.logs import logger, run_log
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, lock_run, prepare_training, refuse_trained, save_run
 from wildgs.scene import Scene, load_scene
+from wildgs.scene.carried import describe_carried
 from wildgs.scene.config import parse_bytes
 from wildgs.threads import limited
 
@@ -236,6 +237,8 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             team=job.team,
             progress=counter(job.progress, "copying photos to the run"),
         )
+        if job.team.first and not resume:
+            logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
         trainer.feature_cache = parse_bytes(job.execution.feature_cache)
         with ExitStack() as stack:
