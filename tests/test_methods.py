@@ -1,12 +1,10 @@
-"""The contract that every registered method keeps, and a method that no other file knows of."""
+"""The contract that every registered method keeps, and the example of docs/methods.md."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import re
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 import torch
@@ -17,32 +15,21 @@ from wildgs.engine.density import DensityConfig
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError
-from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.light.atlas import make_atlas
 from wildgs.light.look import look_of, mix
 from wildgs.light.photos import encode_view
 from wildgs.light.saved import load_look, save_look
 from wildgs.model import registry
-from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.config import InitialConfig, LearningRate, ParsingConfig, SkyConfig, WrappingConfig
-from wildgs.model.gaussians import Gaussians
-from wildgs.model.initial import InitialGaussians
-from wildgs.model.method import (
-    GEOMETRY_ROWS,
-    MemoryUse,
-    Method,
-    ParameterGroup,
-    Stage,
-    TrainingOutput,
-)
+from wildgs.model.appearance import Embeddings
+from wildgs.model.config import InitialConfig, ParsingConfig, SkyConfig, WrappingConfig
+from wildgs.model.method import GEOMETRY_ROWS, Method, Stage
 from wildgs.model.registry import METHODS, create_method, method_type, restore_method
-from wildgs.model.rows import paint_visible, take_rows
 from wildgs.presets import with_preset
-from wildgs.rasterize import blend
 from wildgs.scene import Scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
 
+DOCS = Path(__file__).parents[1] / "docs/methods.md"
 SKY = SkyConfig(points=20)
 SMALL: dict[str, dict[str, Any]] = {
     "wildgs": {
@@ -224,77 +211,18 @@ def test_presets_and_options_fit_every_method(trained: Trainer) -> None:
         method_type("nerf")
 
 
-@dataclass(frozen=True)
-class ToyConfig:
-    """A toy's options.
-
-    Attributes:
-        rate: Learning rate of the colours and the gain.
-    """
-
-    rate: float = 0.05
-    sizes: tuple[int, ...] = field(default=())
-
-
-class Toy(Method):
-    """Flat colours, times the photo's mean brightness, times one learnt gain."""
-
-    name: ClassVar[str] = "toy"
-    label: ClassVar[str] = "Toy"
-    Config: ClassVar[type] = ToyConfig
-    memory: ClassVar[MemoryUse] = MemoryUse(2000, 300, 2**20)
-    sh_degree = 0
-    global_size = 1
-
-    def __init__(self, config: ToyConfig, gaussians: Gaussians) -> None:
-        super().__init__()
-        self.config, self.gaussians = config, gaussians
-        self.gain = torch.nn.Parameter(torch.ones(1))
-
-    @classmethod
-    def rows(cls, config: ToyConfig) -> dict[str, tuple[int, ...]]:
-        return GEOMETRY_ROWS | {"rgb": (3,)}
-
-    @classmethod
-    def create(cls, config: ToyConfig, initial: InitialGaussians) -> Toy:
-        return cls(config, Gaussians(initial.rows | {"rgb": initial.colors.clone()}))
-
-    @classmethod
-    def blank(cls, config: ToyConfig, gaussians: Gaussians, state: Mapping[str, torch.Tensor]) -> Toy:
-        return cls(config, gaussians)
-
-    def row_rates(self) -> dict[str, LearningRate]:
-        return {"rgb": LearningRate(self.config.rate)}
-
-    def parameter_groups(self) -> list[ParameterGroup]:
-        return [ParameterGroup("gain", [self.gain], LearningRate(self.config.rate, 0.1))]
-
-    def encode(self, photo, camera, keep=None, *, name=None, trust_mask=True, explicit=True) -> Appearance:
-        return Appearance(photo.mean()[None])
-
-    def embed(self, appearance, rows=None) -> Embeddings:
-        return Embeddings(appearance.global_embedding)
-
-    def fuse(self, embeddings, rows=None):
-        rgb = self.gaussians.rows["rgb"]
-        rgb = rgb if rows is None else take_rows(rgb, rows)
-        return rgb_to_sh0(self.gain * embeddings.global_embedding * rgb)[:, None]
-
-    def training_pass(self, photo, camera, stage, keep=None, *, name=None) -> TrainingOutput:
-        projection = self.gaussians.project(camera)
-        projection.means2d.retain_grad()
-        colors = paint_visible(self, projection, self.encode(photo, camera), 0)
-        return TrainingOutput(blend(projection, colors), projection, None)
-
-
-def test_a_method_is_one_file_and_one_line(
-    landmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_example_in_the_docs_is_one_file_and_one_line(
+    landmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Train with its own option, resume, evaluate, render, save a light, bench: by the command line."""
+    """Train with its own option, evaluate, render, save a light, bench: by the command line."""
     from wildgs.cli import main
 
-    monkeypatch.setitem(registry.METHODS, "toy", registry.Registered(f"{__name__}:Toy"))
-    monkeypatch.setitem(sys.modules, __name__, sys.modules[Toy.__module__])
+    (code,) = re.findall(
+        r"^```python\n(.*?)^```$", DOCS.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
+    (tmp_path / "toy_of_the_docs.py").write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(registry.METHODS, "toy", registry.Registered("toy_of_the_docs:Toy"))
 
     def wildgs(*arguments: object) -> None:
         main([str(argument) for argument in arguments])

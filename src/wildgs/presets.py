@@ -1,4 +1,4 @@
-"""Named configurations: the paper as printed, the paper mended, the best that we measured, and the quick one."""
+"""Named configurations: the default, the paper as printed, the paper with training as by default, the quick one."""
 
 from __future__ import annotations
 
@@ -43,14 +43,17 @@ _PAPER: dict[str, Any] = {
     "train.density.prune_reach": 0.0,
     "train.density.reset_unseen": True,
 }
-"""What the default has and the paper has not."""
+"""What the default has and the paper does not have, switched off or set to the paper's value."""
 _PRINTED: dict[str, Any] = {
     "model.parsing.bounded_logits": False,
     "model.fusion.direct_path": False,
     "train.objective.mask_gradient": "loss",
     "train.schedule.mask_pause": 0,
 }
-"""What the paper has not either, and without which training as printed fails (docs/study.md)."""
+"""Further options of the default that the paper does not have; the preset `paper-mended` keeps them on.
+
+They concern how the mask and the fusion train, not what the model can represent.
+"""
 
 PRESETS: dict[PresetName, Preset] = {
     "default": Preset(),

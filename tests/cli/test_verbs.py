@@ -90,6 +90,10 @@ MISTAKES = {
         "neither a photo",
     ),
     "no photos": (("sfm", "{tmp}", "--output", "{tmp}/scene"), "no photo"),
+    "no room for a colour": (
+        ("train", "{landmark}", "--output", "{tmp}/run", "--fusion.intrinsic-size", "2"),
+        "intrinsic_size 2: must be 3 or more",
+    ),
     "bad downscale": (("train", "{landmark}", "--output", "{tmp}/run", "--downscale", "0"), "downscale"),
 }
 

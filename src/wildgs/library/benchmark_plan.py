@@ -200,7 +200,7 @@ def method_config(method: str, base: RunConfig, reference: PresetName = "default
     Raises:
         UserError: There is no such method.
     """
-    if method not in BENCH_METHODS:
+    if method not in BENCH_METHODS and method not in METHODS:
         raise UserError(f"--methods {method}: unknown; choose from {', '.join(BENCH_METHODS)}")
     if method in PRESETS:
         return with_preset(base, method)
