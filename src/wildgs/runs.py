@@ -180,7 +180,9 @@ def start_training(
     """
     team = team or Team()
     team.from_first(lambda: _claim(folder, config))
-    with team.together():
+    device = device or default_device()
+    # The trainer keeps the generators' states; the process gets its own back.
+    with team.together(), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.train.seed)
         points, colors = _within_budget(scene, config)
         dense = ground = None
@@ -188,7 +190,7 @@ def start_training(
             dense = _dense_points(scene, config, len(points))
             ground = _ground_points(scene, config, (points, colors), dense)
         method = create_method(config.method, config.model, points, colors, dense, ground)
-        return Trainer(method.to(device or default_device()), scene, config.train, team)
+        return Trainer(method.to(device), scene, config.train, team)
 
 
 def _claim(folder: Path, config: RunConfig) -> None:

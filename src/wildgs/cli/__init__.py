@@ -51,7 +51,8 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if processes.world_size() > 1 and verb not in DISTRIBUTED:
             raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
-        _run(verb, rest)
+        with processes.library_environment():
+            _run(verb, rest)
     except ReportedError:
         sys.exit(USER_ERROR)
     except UserError as error:

@@ -110,9 +110,11 @@ class Parsing(MixedModule):
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
         networks = (self.encoder, self.decoder, self.mask_head, self.global_mlp)
-        coarse, embedding = self.replays(
-            self._networks, networks, self.shrink(photo), (learn_encoder, learn_mask)
-        )
+        image = self.shrink(photo)
+        if learn_mask:
+            coarse, embedding = self.replays(self._networks, networks, image, (learn_encoder, True))
+        else:  # the few steps after an opacity reset are not worth graphs of their own
+            coarse, embedding = self._networks(image, learn_encoder, False)
         logits = functional.interpolate(coarse, size=photo.shape[:2], mode="bilinear", align_corners=False)
         return _Bounded.apply(logits[0, 0]).sigmoid(), embedding
 
