@@ -8,6 +8,7 @@
 # that are newer than their source are kept, so that an interrupted call continues. OUTPUT/log has one line a file.
 # --only: file names to compile (a shell pattern); nothing is linked then.
 set -euo pipefail
+shopt -s extglob
 
 python=python3 arch=9.0 output=gsplat-build only=
 while [ $# -gt 0 ]; do

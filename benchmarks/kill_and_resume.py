@@ -44,6 +44,7 @@ PRELOADED = ["wildgs.cli.train", "wildgs.rasterize.cpu.backend", "torch.utils.te
 
 def _kill_inside(stage: str, saves: int) -> None:
     """Lets this process kill itself at a stage of its n-th checkpoint."""
+    from wildgs import files
     from wildgs.engine import checkpoint
 
     left = saves
@@ -52,7 +53,7 @@ def _kill_inside(stage: str, saves: int) -> None:
         if stage == name and left <= 0:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    save_file, flush, replace = checkpoint.save_file, checkpoint._flush, Path.replace
+    save_file, flush, replace = checkpoint.save_file, files._flush, Path.replace
 
     def saving(tensors: dict[str, Any], path: Path, metadata: dict[str, str]) -> None:
         nonlocal left
@@ -65,16 +66,16 @@ def _kill_inside(stage: str, saves: int) -> None:
         die_at("written, not flushed")
 
     def flushing(path: Path) -> None:
-        if path.is_dir():
+        if path.is_dir() and path.name == "checkpoints":
             die_at("renamed, old ones kept")
         flush(path)
 
     def replacing(self: Path, target: Path) -> Path:
-        if self.name.startswith("step_"):
+        if self.name.startswith(".step_"):
             die_at("flushed, not renamed")
         return replace(self, target)
 
-    checkpoint.save_file, checkpoint._flush = saving, flushing
+    checkpoint.save_file, files._flush = saving, flushing
     Path.replace = replacing  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -144,7 +145,7 @@ def _run(command: Command, folder: Path) -> int:
         killed += 1
         checkpoints = list_checkpoints(output / "checkpoints")
         newest = checkpoints[-1].stem if checkpoints else "none yet"
-        partial = len(list(output.rglob("*.partial")))
+        partial = len(list(output.rglob(".*.part")))
         print(
             f"{killed:>3}  {stage or f'{delay:.2f} s after the first step':<32}  {newest:<17}  {partial}",
             flush=True,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import reprlib
 import types
 import typing
@@ -128,15 +127,13 @@ class _Loader(yaml.SafeLoader):
 
 
 def write_config(path: Path, config: RunConfig) -> None:
-    """Writes YAML, aside and renamed: a reader never sees half of it.
+    """Writes YAML atomically.
 
     Raises:
         UserError: The disk is full, or the folder cannot be written to.
     """
-    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
+    with written_aside(path, flush=True) as aside, aside.open("w", encoding="utf-8") as file:
         yaml.safe_dump(to_plain(config), file, sort_keys=False)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def read_config(path: Path) -> RunConfig:

@@ -1,32 +1,100 @@
-"""Files that are there whole or not at all."""
+"""Reading and writing files: atomic writes, and regular files only."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from wildgs.errors import UserError
 
+MAX_NAME_BYTES = 255
+"""Longest file name that common file systems take."""
+
+ASIDE_SUFFIX = ".part"
+
 
 @contextmanager
-def written_aside(file: Path) -> Iterator[Path]:
-    """A place beside a file, which takes its name when the block ends well; nothing half is left in any case.
+def written_aside(file: Path, *, flush: bool = False) -> Iterator[Path]:
+    """Atomic write: gives a temporary path beside `file`, which is renamed to `file` when the block ends well.
+
+    Readers see the old file or the whole new one. When the block fails, the temporary file is removed and the old
+    file stays. The new file has the permissions that the process gives to any new file (its umask), whatever the
+    code in the block created it with.
 
     Args:
-        file: What is to be written; its folder is made where it is missing.
+        file: The file to write; its folder is created if it does not exist.
+        flush: Whether to wait until file and folder are on the disk (fsync), so that they survive a power cut.
 
     Raises:
-        UserError: The disk is full, or the folder cannot be written to.
+        UserError: The file cannot be written, for example because the disk is full or the folder is read-only.
     """
-    aside = file.with_name(f".{file.name}.part")
+    aside = _aside(file)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         try:
+            with aside.open("wb"):
+                pass
+            mode = stat.S_IMODE(aside.stat().st_mode)
             yield aside
+            if stat.S_IMODE(aside.stat().st_mode) != mode:
+                aside.chmod(mode)
+            if flush:
+                _flush(aside)
             aside.replace(file)
+            if flush:
+                _flush(file.parent)
         except BaseException:
             aside.unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise UserError(f"{file} cannot be written ({error}); make room or choose another place") from error
+        raise UserError(
+            f"{file} cannot be written ({error}); free disk space, fix permissions or choose another place"
+        ) from error
+
+
+def _aside(file: Path) -> Path:
+    """A hidden name in the same folder, of this process alone and short enough for any file system."""
+    ending = f".{os.getpid()}{ASIDE_SUFFIX}"
+    name = file.name
+    if len(os.fsencode(name)) + 1 + len(ending) > MAX_NAME_BYTES:
+        name = hashlib.sha256(os.fsencode(name)).hexdigest()[:32]
+    return file.with_name(f".{name}{ending}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes temporary files that killed processes left in a folder which no other process writes to now."""
+    for leftover in folder.glob(f".*{ASIDE_SUFFIX}"):
+        leftover.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Waits until a file, or the entries of a folder, are on the disk."""
+    if path.is_dir() and os.name == "nt":  # folders cannot be opened there
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def is_file(path: Path) -> bool:
+    """Whether a path is a regular file, or a link to one; False as well for names that no file system takes."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that is too long, a null character
+        return False
+
+
+def check_regular(path: Path) -> None:
+    """Refuses what may never end when it is read: pipes, sockets and devices such as /dev/zero.
+
+    Raises:
+        OSError: The path is no regular file, does not exist or cannot be reached.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError("not a regular file")

@@ -1,7 +1,7 @@
 """Numba's `njit` with a cache on disk, keyed by the digest of all files that a kernel may be compiled from.
 
-Numba's own cache looks at the file of a kernel alone, so that after an edit of a file whose functions the kernel calls
-the old code would run. It also fails where neither the package nor the home folder can be written to.
+Numba's own cache looks at the file of a kernel alone, so that after an edit of another file whose functions the
+kernel calls the old code would run. It also fails where neither the package nor the home folder can be written to.
 """
 
 from __future__ import annotations

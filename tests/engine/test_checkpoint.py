@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.engine import checkpoint as module
-from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
+from wildgs.engine.checkpoint import (
+    DamagedCheckpointError,
+    list_checkpoints,
+    load_checkpoint,
+    load_newest,
+    save_checkpoint,
+)
 from wildgs.errors import UserError, WildGSWarning
 
 STATE = {
@@ -62,7 +68,7 @@ def test_no_flipped_bit_goes_unseen(whole: bytes, tmp_path_factory, data: st.Dat
     path.write_bytes(flipped)
     try:
         checkpoint = load_checkpoint(path)
-    except UserError:
+    except DamagedCheckpointError:
         return
     assert checkpoint.header == {"note": "ä"}, (
         "only a bit that says nothing may pass (the checksum's own name)"
@@ -75,7 +81,7 @@ def test_no_flipped_bit_goes_unseen(whole: bytes, tmp_path_factory, data: st.Dat
 def test_no_truncation_goes_unseen(whole: bytes, tmp_path_factory, keep: int) -> None:
     path = tmp_path_factory.getbasetemp() / "short.safetensors"
     path.write_bytes(whole[: keep % len(whole)])
-    with pytest.raises(UserError, match="not a readable checkpoint"):
+    with pytest.raises(DamagedCheckpointError, match="damaged"):
         load_checkpoint(path)
 
 
@@ -105,7 +111,7 @@ def test_all_damaged_is_a_users_mistake_and_none_is_none(tmp_path: Path) -> None
         path.write_bytes(b"")
     with (
         pytest.warns(WildGSWarning, match="step_00000002"),
-        pytest.raises(UserError, match="no checkpoint is whole"),
+        pytest.raises(UserError, match="all checkpoints are damaged"),
     ):
         load_newest(tmp_path)
 
@@ -113,25 +119,25 @@ def test_all_damaged_is_a_users_mistake_and_none_is_none(tmp_path: Path) -> None
 def test_damage_to_the_checksums_own_name_is_seen(whole: bytes, tmp_path: Path) -> None:
     path = tmp_path / "step_00000001.safetensors"
     path.write_bytes(whole.replace(b"sha256", b"sha257").replace(b'"x"', b'"y"'))
-    with pytest.raises(UserError, match="no checksum"):
+    with pytest.raises(UserError, match="its header is incomplete"):
         load_checkpoint(path)
 
 
 def test_what_a_killed_writer_left_is_cleared(tmp_path: Path) -> None:
-    (tmp_path / "step_00000001.partial").write_bytes(b"half")
+    (tmp_path / ".step_00000001.safetensors.123.part").write_bytes(b"half")
     kept = save(tmp_path, 2)
     assert list(tmp_path.iterdir()) == kept
 
 
-@pytest.mark.parametrize("where", ["save_file", "_flush"])
+@pytest.mark.parametrize("where", ["wildgs.engine.checkpoint.save_file", "wildgs.files._flush"])
 def test_a_failed_write_leaves_the_old_ones(tmp_path: Path, monkeypatch, where: str) -> None:
     kept = save(tmp_path, 1, 2)
 
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module, where, fail)
-    with pytest.raises(UserError, match=r"cannot be written .*No space left.*make room"):
+    monkeypatch.setattr(where, fail)
+    with pytest.raises(UserError, match=r"cannot be written .*No space left.*free disk space"):
         save(tmp_path, 3)
     assert sorted(tmp_path.iterdir()) == kept
     monkeypatch.undo()
@@ -144,7 +150,7 @@ def test_ctrl_c_while_writing_leaves_nothing_half(tmp_path: Path, monkeypatch) -
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_flush", interrupt)
+    monkeypatch.setattr("wildgs.files._flush", interrupt)
     with pytest.raises(KeyboardInterrupt):
         save(tmp_path, 2)
     assert sorted(tmp_path.iterdir()) == kept
@@ -159,7 +165,30 @@ def test_a_full_disk_costs_no_checkpoint(small_disk: Path) -> None:
     newest = load_newest(small_disk)
     assert newest is not None
     assert torch.equal(newest.state["x"], state["x"])
-    assert [path.name for path in small_disk.iterdir() if "partial" in path.name] == []
+    assert [path.name for path in small_disk.iterdir() if ".part" in path.name] == []
     list_checkpoints(small_disk)[0].unlink()
     save_checkpoint(small_disk, 3, state, {})
     assert len(list_checkpoints(small_disk)) == 2
+
+
+@pytest.mark.parametrize("error", [MemoryError("no memory"), RuntimeError("no memory"), OSError(13, "no")])
+def test_what_cannot_be_read_for_another_reason_is_not_called_damaged(
+    tmp_path: Path, monkeypatch, error: Exception
+) -> None:
+    kept = save(tmp_path, 1, 2)
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("wildgs.engine.checkpoint.safe_open", fail)
+    with pytest.raises(UserError, match=r"step_00000002.* cannot be read .*the file stays as it is"):
+        load_newest(tmp_path, set_aside=True)
+    assert list_checkpoints(tmp_path) == kept
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+def test_a_checkpoint_has_the_permissions_of_any_new_file(tmp_path: Path) -> None:
+    (path,) = save(tmp_path, 1)
+    other = tmp_path / "other"
+    other.write_bytes(b"")
+    assert path.stat().st_mode == other.stat().st_mode

@@ -43,7 +43,7 @@ _BAD_MASK = ("error", r"masks.p02\.png.*mend the mask or remove it", "error: men
 _BAD_DEPTH = ("left out", r"depth.p02\.png.*trains without depth", "photo trains without depth")
 _NOT_WRITTEN: dict[str, Cell] = {
     "read-only": ("error", "cannot be written", "error"),
-    "full disk": ("error", "cannot be written .*make room", "error"),
+    "full disk": ("error", "cannot be written .*free disk space", "error"),
 }
 _NO_APPEARANCE = ("error", "is no appearance file", "error")
 _DAMAGED = ("left out", r"step_00000002\.safetensors is damaged", "the one before is used")
@@ -124,7 +124,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "read-only": ("error", "cannot be written", "error; those before are kept"),
         "full disk": (
             "error",
-            "cannot be written .*make room",
+            "cannot be written .*free disk space",
             "warning, tried again; those before are kept",
         ),
         "link loop": _DAMAGED,

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import filelock
 import torch
 import tyro
 from rich.table import Table
@@ -28,9 +31,7 @@ from wildgs.cli.progress import console
 from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.config import RunConfig
 from wildgs.engine.checkpoint import list_checkpoints
-from wildgs.engine.collectives import raise_once
 from wildgs.engine.distributed import settle
-from wildgs.engine.job_queue import JobQueue
 from wildgs.engine.trainer import TrainConfig
 from wildgs.errors import ReportedError, UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
@@ -48,6 +49,12 @@ from wildgs.version import __version__
 
 PROTOCOLS: tuple[Protocol, ...] = ("full", "half")
 MOST_NOTES = 12
+CLAIM_FILE = ".bench.lock"
+FAILURE_FILE = "bench_failure.txt"
+"""In the folder of a run that failed: why. A later bench tries the run again."""
+POLL_SECONDS = 2.0
+RANK_0_REPORTS = 10.0
+"""Seconds that other ranks wait before they end with a mistake that rank 0 reports."""
 WIDTH_IN_FILES = 240
 """Characters that the printed table may take where no terminal has to show it."""
 
@@ -58,7 +65,8 @@ class Command:
 
     The same command goes on where it stopped and skips what is done; with more scenes, methods, variants or
     seeds it does what is new. The table (table.md, table.csv, table.json) is written anew after every run.
-    Started by torchrun, every process takes the next run that nobody has.
+    Several processes with one --output share the work: those that torchrun started, or this command started
+    several times. Each takes the next run that no other one trains.
 
     Example: wildgs bench scenes/gate --output bench --steps 3000 --downscale 2 --methods 3dgs wildgs
     """
@@ -90,45 +98,41 @@ def run(command: Command) -> None:
     Raises:
         UserError: The command makes no sense, or some runs failed.
     """
-    queue = JobQueue("bench")
     if processes.world_size() > 1:
         settle()
-    jobs = _plan_together(command, queue)
-    console.quiet = not queue.first
+    first = processes.rank() == 0
+    console.quiet = not first
+    jobs = _plan_alike(command)
     bench = _Bench(command, jobs)
     done = sum(map(bench.is_done, jobs))
     console.print(f"{len(jobs)} runs, {done} of them done already -> {command.output}")
-    for number in queue.take(len(jobs)):
-        if bench.is_done(jobs[number]):
-            continue
-        print(f"{_speaker()}run {number + 1} of {len(jobs)}: {jobs[number].title}", flush=True)
-        bench.do(jobs[number])
-        if queue.first:
-            bench.write_table()
-    failures = {
-        title: why for each in queue.gather("failures", bench.failures) for title, why in each.items()
-    }
-    if queue.first:
-        _print_table(bench.write_table())
+    for number, job in bench.open_jobs():
+        print(f"{_speaker()}run {number + 1} of {len(jobs)}: {job.title}", flush=True)
+        bench.do(job)
+        bench.write_table()
+    rows = bench.write_table()
+    if first:
+        _print_table(rows)
     console.print(f"{command.output / 'table.md'}, table.csv and table.json hold the table")
+    failures = bench.failures()
     if failures:
-        _tell(failures, len(jobs), queue)
+        _report_failures(failures, len(jobs))
 
 
-def _plan_together(command: Command, queue: JobQueue) -> list[Job]:
-    """The jobs, which must make sense to all processes; the first one tells what does not."""
-    jobs: list[Job] = []
-    own: UserError | None = None
+def _plan_alike(command: Command) -> list[Job]:
+    """The jobs; a mistake in the command is reported by rank 0 alone."""
     try:
-        jobs = _plan(command)
+        return _plan(command)
     except UserError as error:
-        own = error
-    raise_once(queue.gather("mistakes", None if own is None else str(own)), processes.rank(), own)
-    return jobs
+        if processes.rank():
+            time.sleep(RANK_0_REPORTS)  # torchrun ends all processes with the first that fails
+            raise ReportedError(str(error)) from error
+        raise
 
 
-def _tell(failures: Mapping[str, str], count: int, queue: JobQueue) -> None:
-    if not queue.first:
+def _report_failures(failures: Mapping[str, str], count: int) -> None:
+    if processes.rank():
+        time.sleep(RANK_0_REPORTS)
         raise ReportedError("a run of the bench failed")
     title, reason = next(iter(failures.items()))
     raise UserError(
@@ -162,7 +166,7 @@ class _Bench:
     def __init__(self, command: Command, jobs: Sequence[Job]) -> None:
         self.command = command
         self.jobs = jobs
-        self.failures: dict[str, str] = {}
+        self._began = time.time()
         lpips, _ = load_lpips(command.lpips)
         self._network = None if lpips is None else lpips.network
         self._scene: tuple[RunConfig, Scene] | None = None
@@ -179,15 +183,50 @@ class _Bench:
         # A finished run whose checkpoints were deleted keeps its scores.
         return same_network or not list_checkpoints(job.folder / CHECKPOINT_FOLDER)
 
+    def open_jobs(self) -> Iterator[tuple[int, Job]]:
+        """Jobs that are neither done nor failed, with their numbers, until none is left; waits for other processes.
+
+        A process that ends without finishing its job leaves it open, and one of the others takes it.
+        """
+        while True:
+            waiting = False
+            for number, job in enumerate(self.jobs):
+                if self._is_closed(job):
+                    continue
+                with _claim(job.folder) as claimed:
+                    waiting |= not claimed
+                    if claimed and not self._is_closed(job):
+                        yield number, job
+            if not waiting:
+                return
+            time.sleep(POLL_SECONDS)
+
+    def _is_closed(self, job: Job) -> bool:
+        return self.is_done(job) or self.failure(job) is not None
+
+    def failure(self, job: Job) -> str | None:
+        """Why a job failed since this bench began, in whatever process; None where it did not."""
+        file = job.folder / FAILURE_FILE
+        try:
+            return file.read_text(encoding="utf-8") if file.stat().st_mtime >= self._began else None
+        except OSError:
+            return None
+
+    def failures(self) -> dict[str, str]:
+        """All jobs that failed, by title."""
+        found = {job.title: self.failure(job) for job in self.jobs}
+        return {title: reason for title, reason in found.items() if reason is not None}
+
     def do(self, job: Job) -> None:
         """Trains and scores what is left of a job; notes its failure where it lies with this run."""
         try:
             scene = self._read_scene(job.config)
             train_job(job, scene)
             self._score(job, scene)
+            (job.folder / FAILURE_FILE).unlink(missing_ok=True)
         except (UserError, MemoryError, torch.OutOfMemoryError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self.failures[job.title] = reason
+            _write_text(job.folder / FAILURE_FILE, reason)
             print(f"{_speaker()}failed: {reason}", flush=True)
 
     def _read_scene(self, config: RunConfig) -> Scene:
@@ -274,6 +313,27 @@ def _notes(scores: Sequence[Score]) -> list[str]:
     lines = [note for note in notes if not note.startswith("LPIPS v0.1")]
     more = len(lines) - MOST_NOTES
     return lines[:MOST_NOTES] + ([f"{more} more notes in the runs' metrics.json."] if more > 0 else [])
+
+
+@contextmanager
+def _claim(folder: Path) -> Iterator[bool]:
+    """Whether this process may work in a run folder while the block runs; the claim ends with the process."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / CLAIM_FILE, timeout=0)
+        lock.acquire()
+    except filelock.Timeout:
+        yield False
+        return
+    except NotImplementedError:  # a disk without locks; processes that share it may repeat each other's work
+        yield True
+        return
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
+    try:
+        yield True
+    finally:
+        lock.release()
 
 
 def _write_text(file: Path, text: str) -> None:

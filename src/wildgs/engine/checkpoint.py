@@ -1,10 +1,9 @@
-"""Checkpoints: safetensors with a JSON header and a checksum, written aside, flushed, renamed."""
+"""Checkpoints: safetensors with a JSON header and a checksum, written atomically."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import warnings
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import remove_leftovers, written_aside
 
 KEPT = 2
 DAMAGED = ".damaged"
@@ -49,14 +49,17 @@ class Checkpoint:
         return _digest({k: v for k, v in self.state.items() if k not in _TIMINGS}, "")
 
 
-def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> Path:
-    """Writes ``step_NNNNNNNN.safetensors`` into a folder; the last two are kept.
+class DamagedCheckpointError(UserError):
+    """The content of a checkpoint is not what was written: cut short, or changed on the disk."""
 
-    A reader never sees half a file: it is written under another name, flushed to disk, and renamed, and the
-    folder is flushed. Whatever stops this leaves the checkpoints that were there before.
+
+def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> Path:
+    """Writes ``step_NNNNNNNN.safetensors`` atomically and flushed to the disk; the last two are kept.
+
+    Whatever stops this leaves the earlier checkpoints as they were.
 
     Args:
-        folder: Created where it is missing.
+        folder: Created if it does not exist.
         step: Names the file.
         state: Flat tensors.
         header: JSON values.
@@ -65,40 +68,24 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: d
         UserError: The disk is full, or the folder cannot be written to.
     """
     path = folder / f"step_{step:08d}.safetensors"
-    aside = path.with_suffix(".partial")
     tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
     text = json.dumps(header)
     metadata = {"wildgs": text, "sha256": _digest(tensors, text)}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for stale in folder.glob("*.partial"):
-            stale.unlink()
-        try:
-            save_file(tensors, aside, metadata=metadata)
-            _flush(aside)
-            aside.replace(path)
-        except BaseException:
-            aside.unlink(missing_ok=True)
-            raise
-        _flush(folder)
+        remove_leftovers(folder)
+        with written_aside(path, flush=True) as aside:
+            try:
+                save_file(tensors, aside, metadata=metadata)
+            except SafetensorError as error:  # so it reports a full disk
+                raise OSError(error) from error
         for old in list_checkpoints(folder)[:-KEPT]:
             old.unlink()
-    except (OSError, SafetensorError) as error:
+    except (OSError, UserError) as error:
         raise UserError(
-            f"{path} cannot be written ({error}); checkpoints from before are kept: make room, then --resume"
+            f"{path} cannot be written ({error.__cause__ or error}); earlier checkpoints are kept: "
+            "free disk space or fix permissions, then --resume"
         ) from error
     return path
-
-
-def _flush(path: Path) -> None:
-    """Asks the system to bring a file or a folder's entries to the disk."""
-    if path.is_dir() and os.name == "nt":  # folders cannot be opened there
-        return
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _digest(tensors: dict[str, Tensor], header: str) -> str:
@@ -119,46 +106,68 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Reads a checkpoint.
+    """Reads a checkpoint and compares its checksum.
 
     Raises:
-        UserError: The file is missing, damaged, or no checkpoint.
+        DamagedCheckpointError: Its content is not what was written.
+        UserError: The file is missing, or cannot be read for another reason (permissions, memory).
     """
     try:
+        with path.open("rb"):  # tells a missing permission from damage
+            pass
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             # Copies, since tensors in the file lie at any address, and sums depend on alignment to the last bit.
             state = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a dict
-        header = json.loads(metadata["wildgs"])
-        if not isinstance(header, dict):
-            raise ValueError("its header is no mapping")
-        if "sha256" not in metadata:  # damage may hit the checksum's own name
-            raise ValueError("it has no checksum")
-        if metadata["sha256"] != _digest(state, metadata["wildgs"]):
-            raise ValueError("its checksum does not match")
-    except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
-        raise UserError(f"{path} is not a readable checkpoint ({error}); use another one") from error
-    return Checkpoint(state, header)
+        return Checkpoint(state, _checked_header(metadata, state))
+    except (_DamageError, SafetensorError) as error:
+        if "os error" in str(error):
+            raise UserError(f"{path} cannot be read ({error}); {_NOT_DAMAGED}") from error
+        raise DamagedCheckpointError(f"{path} is damaged ({error}); use another checkpoint") from error
+    except (OSError, MemoryError, RuntimeError) as error:  # torch reports missing memory as a RuntimeError
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{path} cannot be read ({reason}); {_NOT_DAMAGED}") from error
+
+
+_NOT_DAMAGED = "the file stays as it is: free memory or fix permissions, then try again"
+
+
+class _DamageError(Exception):
+    """Why a checkpoint's content cannot be used."""
+
+
+def _checked_header(metadata: dict[str, str], state: dict[str, Tensor]) -> dict[str, Any]:
+    """The header of a checkpoint whose checksum fits."""
+    try:
+        text, checksum = metadata["wildgs"], metadata["sha256"]
+        header = json.loads(text)
+    except (KeyError, ValueError, RecursionError) as error:
+        raise _DamageError(f"its header is incomplete: {error}") from error
+    if not isinstance(header, dict):
+        raise _DamageError("its header is not a mapping")
+    if checksum != _digest(state, text):
+        raise _DamageError("its checksum does not match")
+    return header
 
 
 def load_newest(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
-    """The newest checkpoint that is whole, or None where there is none at all.
+    """The newest undamaged checkpoint, or None where there is no checkpoint at all.
 
-    Damaged ones are named in a warning, and the one before is taken.
+    Damaged ones are named in a warning, and the one before is read.
 
     Args:
         folder: Where `save_checkpoint` wrote.
         set_aside: Whether to rename damaged ones, so that they do not count among the two that are kept.
 
     Raises:
-        UserError: There are checkpoints, and all are damaged.
+        UserError: All checkpoints are damaged, or the newest cannot be read for another reason.
     """
     paths = list_checkpoints(folder)[::-1]
     for path in paths:
         try:
             return load_checkpoint(path)
-        except UserError as error:
-            reason = str(error.__cause__ or error)
+        except DamagedCheckpointError as error:
+            reason = str(error.__cause__)
         if path != paths[-1]:
             warnings.warn(
                 f"{path} is damaged ({reason}); going back to the checkpoint before it",
@@ -169,6 +178,6 @@ def load_newest(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
                 path.rename(path.with_name(path.name + DAMAGED))
     if paths:
         raise UserError(
-            f"{folder}: no checkpoint is whole; the run has to start anew, in another --output (or delete them)"
+            f"{folder}: all checkpoints are damaged; delete them to start again, or choose another --output"
         )
     return None

@@ -14,6 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import written_aside
 
 
 class Recorder:
@@ -43,7 +44,7 @@ class Recorder:
             self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
         except OSError as error:
             raise UserError(
-                f"{folder} cannot be written to ({error}); free disk space or fix its permissions"
+                f"{folder} cannot be written to ({error}); free disk space or fix permissions"
             ) from error
         self._failed = False
 
@@ -122,6 +123,5 @@ def _keep_until(lines: Path, step: int) -> None:
                 kept.append(line + "\n")
         except (ValueError, KeyError, TypeError):
             continue
-    aside = lines.with_suffix(".partial")
-    aside.write_text("".join(kept), encoding="utf-8")
-    aside.replace(lines)
+    with written_aside(lines) as aside:
+        aside.write_text("".join(kept), encoding="utf-8")

@@ -14,8 +14,12 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from wildgs.errors import UserError
+from wildgs.files import written_aside
 
-SUFFIXES = (".mp4", ".mkv", ".mov")
+MUXERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
+"""ffmpeg's container formats by file ending."""
+
+SUFFIXES = tuple(MUXERS)
 OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
 """Endings by which someone asks for a file that is not written here, not for a folder."""
 
@@ -83,9 +87,9 @@ def write_frames(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
 def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) -> None:
     if size[0] % 2 or size[1] % 2:
         raise UserError(f"{size[0]} x {size[1]}: a video's width and height must be even numbers")
-    with _aside(path) as folder:
-        part = folder / path.name
-        writer = _ffmpeg().write_frames(str(part), size, fps=fps, **ENCODING)
+    encoding = ENCODING | {"output_params": [*ENCODING["output_params"], "-f", MUXERS[path.suffix.lower()]]}
+    with written_aside(path) as aside:
+        writer = _ffmpeg().write_frames(str(aside), size, fps=fps, **encoding)
         try:
             writer.send(None)
             for frame in frames:
@@ -94,7 +98,6 @@ def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
             raise UserError(f"{path}: the video cannot be encoded: {str(error).splitlines()[0]}") from error
         finally:
             writer.close()
-        part.replace(path)
 
 
 def _write_folder(path: Path, frames: Frames) -> None:

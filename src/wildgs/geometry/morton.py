@@ -6,32 +6,40 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-BITS = 10
-"""Cells per side are two to the power of this."""
+MAX_BITS = 21
+"""Three numbers of so many bits fit into 64."""
 
 
-def morton_order(points: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
+def morton_order(points: Float[Tensor, "N 3"], *, bits: int = 10, outside: float = 0.02) -> Int[Tensor, " N"]:
     """Indices that sort points along the Z-shaped curve of Morton (1966).
 
-    The curve's cells divide the box between the 2% and the 98% point of each axis; what lies outside counts to the
-    cells at its border. Points of one cell keep their order.
+    The curve's cells divide a box that holds most points; what lies outside counts to the cells at its border.
+    Points of one cell keep their order.
 
     Args:
-        points: World coordinates; those that are no numbers come first.
+        points: World coordinates; those that are NaN come first.
+        bits: The box has ``2**bits`` cells per side; at most 21.
+        outside: Share of the points that lie outside the box on each side of each axis.
     """
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.long, device=points.device)
     ordered = points.nan_to_num().sort(dim=0).values
     last = len(points) - 1
-    low, high = ordered[round(0.02 * last)], ordered[round(0.98 * last)]
+    low, high = ordered[round(outside * last)], ordered[round((1 - outside) * last)]
     share = (points - low) / (high - low).clamp_min(torch.finfo(points.dtype).tiny)
-    cells = (share.nan_to_num().clamp(0, 1) * (2**BITS - 1)).long()
+    cells = (share.nan_to_num().clamp(0, 1) * (2**bits - 1)).long()
     x, y, z = _spread(cells).unbind(1)
     return (x | (y << 1) | (z << 2)).argsort(stable=True)
 
 
 def _spread(numbers: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
-    """Two empty bits after every bit, for numbers of at most ten bits."""
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+    """Two empty bits after every bit, for numbers of at most `MAX_BITS` bits."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
         numbers = (numbers | (numbers << shift)) & mask
     return numbers

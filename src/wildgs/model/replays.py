@@ -20,7 +20,7 @@ from wildgs.errors import WildGSWarning
 EAGER_CALLS = 2
 """Calls of one shape before it is recorded: a shape that comes once is not worth it."""
 MOST_GRAPHS = 28
-"""Further shapes run without. Parsing shrinks photos to 13 shapes, each with or without gradients to the encoder."""
+"""Further shapes run without. Parsing has 13 shapes at most, each with or without gradients to the encoder."""
 TOLERANCE = 0.05
 """Relative difference up to which a graph is accepted, in the Euclidean norm over all outputs, and over all
 gradients: two runs in bfloat16, and kernels that libraries choose differently while recording. Single small tensors

@@ -6,8 +6,6 @@ scene's `depth/` folder, where the depth loss finds it.
 
 from __future__ import annotations
 
-import os
-import tempfile
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import written_aside
 from wildgs.hub import hub_reachable
 from wildgs.scene.colmap import read_model
 from wildgs.scene.images import MAX_IMAGE_PIXELS, UnreadableImageError, read_photo
@@ -217,14 +216,5 @@ def _to_16_bits(disparity: Float[Tensor, "H W"]) -> UInt16[np.ndarray, "h w"]:
 
 
 def _write_png(values: UInt16[np.ndarray, "H W"], target: Path) -> None:
-    """Written aside and renamed, so that a picture is there whole or not at all."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=".", suffix=".partial")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            Image.fromarray(values).save(file, "PNG")
-        Path(name).chmod(0o644)
-        Path(name).replace(target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    with written_aside(target) as aside:
+        Image.fromarray(values).save(aside, "PNG")
