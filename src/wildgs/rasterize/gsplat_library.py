@@ -125,7 +125,7 @@ def build_help() -> str:
     """What building gsplat's extension needs, for error messages and `wildgs doctor`."""
     wanted = torch.version.cuda or "the CUDA version of your torch"
     return (
-        f"install nvcc {wanted} (the version that torch was built with), a C++ compiler and ninja, and set CUDA_HOME "
+        f"install nvcc {wanted} (the version of your torch), a C++ compiler and ninja, and set CUDA_HOME "
         "to the toolkit if it is not found; the build takes 2 to 15 minutes once (TORCH_CUDA_ARCH_LIST=9.0 is the "
         "GPU's architecture, MAX_JOBS limits parallel compilers); `wildgs doctor --build-gsplat` builds it ahead; "
         "CUDA_VISIBLE_DEVICES= runs on the CPU instead"
