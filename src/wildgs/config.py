@@ -14,12 +14,11 @@ from typing import Any, Literal
 import yaml
 import yaml.composer
 
-from wildgs.engine.trainer import TrainConfig
+from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
-from wildgs.model.registry import MethodName
-from wildgs.model.wildgs import WildGSConfig
-from wildgs.scene import DataConfig
+from wildgs.model.config import MethodName, WildGSConfig
+from wildgs.scene.config import DataConfig
 
 MAX_CONFIG_BYTES = 1_000_000
 

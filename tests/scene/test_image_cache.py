@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from wildgs.errors import UserError
 from wildgs.scene import DataConfig, load_scene
-from wildgs.scene.image_cache import _WINDOW, AHEAD, CachedPictures, ImageCache, available_memory, parse_bytes
+from wildgs.scene.config import parse_bytes
+from wildgs.scene.image_cache import _WINDOW, AHEAD, CachedPictures, ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.pictures import Pictures
 

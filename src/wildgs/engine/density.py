@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from wildgs.engine.config import DensityConfig
 from wildgs.engine.optimizers import edit_rows, reset_moments
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
@@ -16,32 +17,6 @@ from wildgs.rasterize import Projection
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6
-
-
-@dataclass(frozen=True)
-class DensityConfig:
-    """Clone, split, prune, reset. Values are 3DGS's.
-
-    Attributes:
-        grow_gradient: Mean screen gradient above which a Gaussian grows, per half picture (3DGS's normalised
-            device coordinates).
-        split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
-        prune_opacity: Fainter Gaussians go.
-        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before. Beyond
-            the extent it is a share of their distance from the middle: what is far may be as large.
-        prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
-            of them float right before a camera and stand for what stood in its way.
-        reset_opacity: Opacities are lowered to this at a reset.
-        max_gaussians: No growth beyond this number.
-    """
-
-    grow_gradient: float = 2e-4
-    split_scale: float = 0.01
-    prune_opacity: float = 0.005
-    prune_scale: float = 0.1
-    prune_reach: float = 0.15
-    reset_opacity: float = 0.01
-    max_gaussians: int = 3_000_000
 
 
 @dataclass(frozen=True)

@@ -4,53 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from wildgs.engine.config import OptimizerConfig
 from wildgs.engine.schedule import exponential
 from wildgs.geometry.morton import morton_order
 from wildgs.model.encoder import Encoder
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
-
-
-@dataclass(frozen=True)
-class OptimizerConfig:
-    """Learning rates. Those of the Gaussians are 3DGS's.
-
-    Attributes:
-        means: Position, at the start, per unit of scene extent.
-        means_final: Position, at the end, per unit of scene extent.
-        scales: Logarithms of the scales.
-        quats: Orientations.
-        opacities: Opacity logits.
-        sh0: Flat colour (3dgs only).
-        shN: Higher harmonics (3dgs only).
-        intrinsic: Intrinsic features (wildgs only).
-        networks: All networks but the encoder, at the start.
-        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
-            thousand steps, and the embedding of every photo becomes the same.
-        network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
-        batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
-            rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
-    """
-
-    means: float = 1.6e-4
-    means_final: float = 1.6e-6
-    scales: float = 5e-3
-    quats: float = 1e-3
-    opacities: float = 5e-2
-    sh0: float = 2.5e-3
-    shN: float = 1.25e-4  # noqa: N815 - the field's name
-    intrinsic: float = 2.5e-3
-    networks: float = 1e-3
-    encoder: float = 1e-4
-    network_decay: float = 0.1
-    batch_scaling: Literal["sqrt", "none"] = "sqrt"
-
 
 _ROW_RATES = {"log_scales": "scales", "opacity_logits": "opacities"}
 

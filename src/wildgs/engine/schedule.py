@@ -2,38 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from wildgs.engine.config import ScheduleConfig
 from wildgs.model.method import Stage
 
 REFERENCE_STEPS = 30_000
 """The paper's training length; schedules below are stated for it and scale with the run's own length."""
-
-
-@dataclass(frozen=True)
-class ScheduleConfig:
-    """Steps are the paper's, of 30,000; a run of another length scales them (floors keep short runs sane).
-
-    Attributes:
-        first_stage: Steps without triplane and depth loss, until the mask is useful.
-        densify_from: First densification (3DGS: 500).
-        densify_until: Last densification and reset (3DGS: 15,000).
-        densify_every: Between densifications (3DGS: 100).
-        reset_every: Between opacity resets (3DGS: 3,000).
-        mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
-            like a transient.
-        sh_every: Between raises of the active SH degree (3DGS: 1,000).
-        encoder_every: The photo's encoder learns on one step in so many (not scaled; paper: 1).
-    """
-
-    first_stage: int = 3000
-    densify_from: int = 500
-    densify_until: int = 15_000
-    densify_every: int = 100
-    reset_every: int = 3000
-    mask_pause: int = 500
-    sh_every: int = 1000
-    encoder_every: int = 2
 
 
 _FLOORS = {

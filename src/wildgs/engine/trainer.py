@@ -5,25 +5,25 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wildgs.engine.density import DensityConfig, DensityControl, DensityReport
+from wildgs.engine.config import TrainConfig
+from wildgs.engine.density import DensityControl, DensityReport
 from wildgs.engine.feed import PhotoFeed
-from wildgs.engine.optimizers import OptimizerConfig, Optimizers, sort_rows
+from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
-from wildgs.engine.schedule import Schedule, ScheduleConfig, falls_on
+from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.losses.objective import Losses, ObjectiveConfig, total_loss
+from wildgs.losses.objective import Losses, total_loss
 from wildgs.model.method import Method, TrainingOutput
 from wildgs.model.precision import (
-    Precision,
     choose_precision,
     lay_out_channels_last,
     set_precision,
@@ -33,36 +33,6 @@ from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
 
 PREPARATION_PHOTOS = 16
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Training.
-
-    Attributes:
-        steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
-        seed: Of everything random.
-        precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
-        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
-        objective: Loss weights.
-        schedule: What happens when.
-        optimizer: Learning rates.
-        density: Densification and pruning.
-    """
-
-    steps: int = 30_000
-    seed: int = 0
-    precision: Precision = "auto"
-    cuda_graphs: bool = True
-    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    density: DensityConfig = field(default_factory=DensityConfig)
-
-    def __post_init__(self) -> None:
-        """Refuses a run without a step."""
-        if self.steps < 1:
-            raise UserError(f"steps {self.steps}: must be 1 or more")
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from wildgs.export.config import CleanupConfig
 from wildgs.export.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.sh_cut import cut_sh, fit_cut
@@ -19,30 +19,6 @@ from wildgs.rasterize import rasterize
 
 BOX_QUANTILE = 0.02
 """Share of the SfM points that a crop to the box leaves out on each side of each axis."""
-
-
-@dataclass(frozen=True)
-class CleanupConfig:
-    """What an export leaves out.
-
-    Attributes:
-        min_opacity: Gaussians fainter than this are dropped.
-        max_distance: Gaussians further from the scene's middle are dropped, in units of the photos' usual depth;
-            None keeps all.
-        crop: Gaussians outside the box that holds nearly all SfM points, times this, are dropped: 1 is that
-            box; None keeps all.
-        sh_degree: Spherical harmonics above this degree are left out (fitted to the photos' directions).
-    """
-
-    min_opacity: float = 0.0
-    max_distance: float | None = None
-    crop: float | None = None
-    sh_degree: int | None = None
-
-    @property
-    def active(self) -> bool:
-        """Whether anything may be left out."""
-        return self != CleanupConfig()
 
 
 def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:

@@ -13,11 +13,11 @@ from torch.nn import functional
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.hub import hub_reachable
+from wildgs.model.config import RESNET18
 
 if TYPE_CHECKING:
     from transformers import ResNetModel
 
-RESNET18 = "microsoft/resnet-18"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 FEATURE_WIDTHS = (64, 64, 128, 256, 512)

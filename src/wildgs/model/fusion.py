@@ -2,35 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.model.config import FusionConfig
 from wildgs.model.precision import MixedModule
-
-
-@dataclass(frozen=True)
-class FusionConfig:
-    """The fusion network.
-
-    Attributes:
-        intrinsic_size: Length of the intrinsic feature (paper: 32).
-        hidden: Width of the two hidden layers.
-        sh_degree: Degree of the predicted spherical harmonics (paper: 3, as 3DGS has).
-        output_scale: Factor on the output layer's initial weights.
-        color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
-            exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
-    """
-
-    intrinsic_size: int = 32
-    hidden: int = 64
-    sh_degree: int = 1
-    output_scale: float = 0.1
-    color_transform: bool = True
 
 
 class Fusion(MixedModule):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from wildgs.model.encoder import FEATURE_WIDTHS, RESNET18, Encoder, load_encoder
+from wildgs.model.config import ParsingConfig
+from wildgs.model.encoder import FEATURE_WIDTHS, Encoder, load_encoder
 from wildgs.model.precision import MixedModule
 from wildgs.model.unet import LEAST_SPREAD, UpBlock, standardize_output
 
@@ -29,27 +29,6 @@ STATIC_BIAS = 2.0
 """Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
 LOGIT_BOUND = 6.0
 """Of the mask, so that it stays within 0.0025 and 0.9975: further out no gradient is left to bring it back."""
-
-
-@dataclass(frozen=True)
-class ParsingConfig:
-    """2D Parsing.
-
-    Attributes:
-        encoder: ResNet-18's folder or hub name.
-        max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
-            anyway, and cost grows with the square.
-        color_statistics: Whether M^G also reads mean and spread of the photo's own colours. Not in the paper; but
-            what five stages leave of a photo says little of its colour cast.
-        global_size: Length of the global embedding (paper: 16).
-        decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
-    """
-
-    encoder: str = RESNET18
-    max_side: int = 256
-    color_statistics: bool = True
-    global_size: int = 16
-    decoder_widths: tuple[int, int, int] = (128, 64, 32)
 
 
 class _Bounded(torch.autograd.Function):

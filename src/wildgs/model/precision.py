@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import Literal
 
 import torch
 from torch import nn
 
+from wildgs.model.config import Precision
 from wildgs.model.replays import Replays
-
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
 class MixedModule(nn.Module):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError
+from wildgs.model.config import MethodName
 from wildgs.model.encoder import load_encoder
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
@@ -16,7 +15,6 @@ from wildgs.model.triplane import Box
 from wildgs.model.vanilla import VanillaGS
 from wildgs.model.wildgs import ColoredPoints, WildGS, WildGSConfig
 
-MethodName = Literal["wildgs", "3dgs"]
 _ROWS = "gaussians.rows."
 
 

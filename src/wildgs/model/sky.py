@@ -7,37 +7,16 @@ cameras. Others have done the same: Kulhanek et al. 2024 (WildGaussians) place p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wildgs.model.config import SkyConfig
 from wildgs.model.gaussians import geometry_from_points
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 COLOR = 0.75
-
-
-@dataclass(frozen=True)
-class SkyConfig:
-    """The shell of Gaussians that stands for the sky at the start.
-
-    Attributes:
-        points: How many; 0 leaves the sky to densification, as the paper does.
-        radius: Of the shell, in units of the aligned frame (photos' median depth); more where the scene's points
-            reach further.
-        reach: The shell lies at this multiple of the distance within which nearly all points are, at least.
-        lowest: Elevation at which the shell ends, degrees. Below the horizon it closes the scene behind ground that
-            too few photos show: such holes are as dark as the background otherwise.
-        opacity: Of its Gaussians at the start.
-    """
-
-    points: int = 5000
-    radius: float = 10.0
-    reach: float = 2.0
-    lowest: float = -90.0
-    opacity: float = 0.5
 
 
 def sky_rows(config: SkyConfig, points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -13,54 +12,23 @@ from torch import Tensor
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.color_match import match_colors
+from wildgs.model.config import Ablation, WildGSConfig
 from wildgs.model.encoder import Encoder
-from wildgs.model.fusion import Fusion, FusionConfig
+from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_points
 from wildgs.model.ground import ground_rows
 from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
-from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.parsing import Parsing
 from wildgs.model.rows import take_rows
 from wildgs.model.sky import COLOR as SKY_COLOR
-from wildgs.model.sky import SkyConfig, sky_rows
+from wildgs.model.sky import sky_rows
 from wildgs.model.triplane import Box, robust_box
-from wildgs.model.wrapping import Wrapping, WrappingConfig
-from wildgs.priors.depth_points import DepthPointsConfig
-from wildgs.priors.ground import GroundConfig
+from wildgs.model.wrapping import Wrapping
 from wildgs.rasterize import Projection, blend
 
 ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
 """Positions in the aligned frame, and 8-bit colours."""
-Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
-"""Parts that can be taken away: the paper's five, and the intrinsic and local features."""
-
-
-@dataclass(frozen=True)
-class WildGSConfig:
-    """The model.
-
-    Attributes:
-        without: Parts left out, for ablations.
-        mask_threshold: Th: pixels above it are static (lifting, depth loss).
-        parsing: 2D Parsing.
-        wrapping: 3D Wrapping.
-        fusion: The fusion network.
-        depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.
-        ground: Gaussians that continue the ground at the start.
-        sky: Gaussians that stand for the sky at the start.
-        color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
-            scene's colours under that are from the photo's. Not in the paper.
-    """
-
-    without: tuple[Ablation, ...] = ()
-    mask_threshold: float = 0.5
-    parsing: ParsingConfig = field(default_factory=ParsingConfig)
-    wrapping: WrappingConfig = field(default_factory=WrappingConfig)
-    fusion: FusionConfig = field(default_factory=FusionConfig)
-    depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
-    ground: GroundConfig = field(default_factory=GroundConfig)
-    sky: SkyConfig = field(default_factory=SkyConfig)
-    color_match: bool = True
 
 
 class WildGS(Method):

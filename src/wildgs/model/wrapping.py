@@ -2,41 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from wildgs.model.config import WrappingConfig
 from wildgs.model.precision import MixedModule
 from wildgs.model.rows import rows_to_shade
 from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_planes
 from wildgs.model.unet import UNet, standardize_output
-
-
-@dataclass(frozen=True)
-class WrappingConfig:
-    """3D Wrapping.
-
-    Attributes:
-        resolution: Cells per side of a plane.
-        features: Channels of a plane's feature map.
-        widths: Channels of the plane UNet, from full resolution down.
-        local_size: Length of the local embedding (paper: 16).
-        crop_ratio: Share of the robust box's sides that the triplane covers (paper: 0.5).
-        box_quantile: Share of SfM points outside the robust box on each side of each axis.
-        partial_lifts: Share of the training steps in which a part of the photo is lifted only. Not in the paper,
-            where every Gaussian that is seen finds its own pixels in the planes, and those that a photo does not
-            show get whatever light comes out.
-    """
-
-    resolution: int = 128
-    features: int = 32
-    widths: tuple[int, ...] = (16, 32, 64, 64)
-    local_size: int = 16
-    crop_ratio: float = 0.5
-    box_quantile: float = 0.005
-    partial_lifts: float = 0.5
 
 
 class Wrapping(MixedModule):

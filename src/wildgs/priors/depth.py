@@ -23,7 +23,8 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import written_aside
 from wildgs.hub import hub_reachable
 from wildgs.scene.colmap import read_model
-from wildgs.scene.images import MAX_IMAGE_PIXELS, UnreadableImageError, read_photo
+from wildgs.scene.config import MAX_IMAGE_PIXELS
+from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.scene.pictures import depth_file
 
 DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
+from wildgs.priors.config import DepthPointsConfig
 from wildgs.scene.scene import Scene, View
 
 MAX_PHOTOS = 200
@@ -25,25 +26,6 @@ _TOLERANCE = 0.05
 _MIN_POINTS, _MIN_INLIERS = 24, 0.4
 _MAX_POINTS = 20_000  # of a photo; more make no better fit and a table of 256 times as many numbers
 _MIN_CORRELATION = 0.7  # where all is about as far, a constant fits, and says nothing of what lies between
-
-
-@dataclass(frozen=True)
-class DepthPointsConfig:
-    """Initial points from depth priors; scenes without depth priors have none.
-
-    Attributes:
-        points: At most so many; 0 starts from SfM points alone, as the paper does.
-        cell: Side of the cells in which photos have to agree, in units of the aligned frame (photos' median depth).
-        support: Photos that have to see a surface in a cell.
-        agreement: Of the photos that look at a cell, least share that see the surface there and not beyond.
-        farthest: Nothing further from a camera than this, in units of the aligned frame.
-    """
-
-    points: int = 20_000
-    cell: float = 0.02
-    support: int = 3
-    agreement: float = 0.3
-    farthest: float = 4.0
 
 
 @dataclass(frozen=True)

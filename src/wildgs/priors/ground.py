@@ -6,12 +6,12 @@ of them shows has no points, and a view that looks there sees through the scene 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
+
+from wildgs.priors.config import GroundConfig
 
 _HYPOTHESES = 512
 _STEEPEST = 0.15
@@ -22,23 +22,6 @@ _LEAST_ABOVE = 0.9
 """Of the cameras, that stand above it."""
 _LEAST_POINTS = 50
 _MAX_POINTS = 20_000  # in the search; more make no better plane and a table of 512 times as many numbers
-
-
-@dataclass(frozen=True)
-class GroundConfig:
-    """Gaussians that continue the ground at the start, where it is level and known in part.
-
-    Attributes:
-        points: At most so many; 0 leaves holes, as the paper does.
-        spacing: Between them, in units of the aligned frame (photos' median depth).
-        reach: How far around the cameras the ground is continued, likewise.
-        tolerance: Height within which a point belongs to the plane, likewise.
-    """
-
-    points: int = 6000
-    spacing: float = 0.04
-    reach: float = 1.0
-    tolerance: float = 0.03
 
 
 def ground_points(

@@ -1,22 +1,34 @@
 """Photos, cameras and sparse points: from a folder to a `Scene`."""
 
+from __future__ import annotations
+
+import importlib
+
 # First of all the libraries that load the system's zlib: pycolmap exports a zlib of its own, and one that is
 # loaded after it would mix its functions with pycolmap's and corrupt the memory when a PNG is written.
 import zlib  # noqa: F401
+from typing import TYPE_CHECKING, Any
 
 import PIL.Image  # noqa: F401
 
-from wildgs.scene.loading import DataConfig, load_scene
-from wildgs.scene.scene import Alignment, Scene, Split, View, find_view, match_view, scene_extent
+if TYPE_CHECKING:
+    from wildgs.scene.config import DataConfig as DataConfig
+    from wildgs.scene.loading import load_scene as load_scene
+    from wildgs.scene.scene import Alignment as Alignment
+    from wildgs.scene.scene import Scene as Scene
+    from wildgs.scene.scene import Split as Split
+    from wildgs.scene.scene import View as View
+    from wildgs.scene.scene import find_view as find_view
+    from wildgs.scene.scene import match_view as match_view
+    from wildgs.scene.scene import scene_extent as scene_extent
 
-__all__ = [
-    "Alignment",
-    "DataConfig",
-    "Scene",
-    "Split",
-    "View",
-    "find_view",
-    "load_scene",
-    "match_view",
-    "scene_extent",
-]
+_MODULES = {"DataConfig": "wildgs.scene.config", "load_scene": "wildgs.scene.loading"} | dict.fromkeys(
+    ("Alignment", "Scene", "Split", "View", "find_view", "match_view", "scene_extent"), "wildgs.scene.scene"
+)
+
+
+def __getattr__(name: str) -> Any:
+    """Imported when first asked for: `wildgs.scene.config` must not wait for torch."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'wildgs.scene' has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)

@@ -8,7 +8,6 @@ good, and a small window holds the others around their turn: hits are as many as
 from __future__ import annotations
 
 import os
-import re
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -27,23 +26,6 @@ AHEAD = 4
 """Photos that are decoded before their turn."""
 
 _WINDOW = AHEAD + 2
-_UNITS = {"": 1, "B": 1} | {
-    prefix + ending: base ** (power + 1)
-    for power, prefix in enumerate("KMGT")
-    for ending, base in (("", 1000), ("B", 1000), ("IB", 1024))
-}
-
-
-def parse_bytes(text: str) -> int:
-    """A size such as ``4GB``, ``500 MB`` or ``2GiB`` in bytes.
-
-    Raises:
-        UserError: It is none.
-    """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
-    if match is None or match[2].upper() not in _UNITS:
-        raise UserError(f"{text!r} is no size; write it as 4GB, 500MB or 2GiB")
-    return int(float(match[1]) * _UNITS[match[2].upper()])
 
 
 class ImageCache:

@@ -13,12 +13,11 @@ import numpy as np
 from jaxtyping import Shaped, UInt8, UInt16
 from PIL import Image, ImageOps
 
+from wildgs.scene.config import MAX_IMAGE_PIXELS
+
 EXIF_ORIENTATION = 0x0112
 ASPECT_TOLERANCE = 0.01
 """Sizes have the same shape when their aspects differ by less than this share (or a pixel's rounding)."""
-
-MAX_IMAGE_PIXELS = 250_000_000
-"""Pictures with more pixels are refused unread: a small file can unpack to more than the memory holds."""
 
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000", "AVIF", "HEIF")
 """What is decoded, whatever a file's name says. Others that Pillow knows start programs (EPS runs Ghostscript)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
-from wildgs.scene.image_cache import DECODERS, CachedPictures, ImageCache, available_memory, parse_bytes
-from wildgs.scene.images import MAX_IMAGE_PIXELS, UnreadableImageError
+from wildgs.scene.config import DataConfig, parse_bytes
+from wildgs.scene.image_cache import DECODERS, CachedPictures, ImageCache, available_memory
+from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.pictures import PhotoFiles, Pictures
 from wildgs.scene.scene import Alignment, Scene, Split, View
 from wildgs.scene.split import assign_splits
@@ -27,34 +28,6 @@ CACHE_SHARE = 0.5
 
 KEPT_PICTURES = 8
 """Photos that a lazily read scene keeps decoded."""
-
-
-@dataclass(frozen=True)
-class DataConfig:
-    """How a scene folder is read."""
-
-    downscale: int | float = 1
-    """Divides the photos' width and height (the paper: 2 on Phototourism)."""
-    holdout: int = 8
-    """Every n-th photo tests where the scene has no .tsv split; 0 = all train."""
-    use_masks: bool = True
-    """Read the user's masks/ (0 = ignore)."""
-    use_depth: bool = True
-    """Read the depth prior in depth/."""
-    max_image_pixels: int = MAX_IMAGE_PIXELS
-    """Pictures with more pixels are left out unread."""
-    image_cache: str = "4GB"
-    """Memory for decoded photos; those beyond it are decoded again at their turn. No influence on the result."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
-        if not 1 <= self.downscale < float("inf"):
-            raise UserError(f"downscale {self.downscale}: must be 1 (full size) or more")
-        if self.holdout < 0 or self.holdout == 1:
-            raise UserError(f"holdout {self.holdout}: must be 0 (all photos train) or at least 2")
-        if self.max_image_pixels < 1:
-            raise UserError(f"max-image-pixels {self.max_image_pixels}: must be above 0")
-        parse_bytes(self.image_cache)
 
 
 def load_scene(

@@ -12,8 +12,8 @@ from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.images import (
-    MAX_IMAGE_PIXELS,
     ShapeMismatchError,
     UnreadableImageError,
     read_disparity,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 
 from wildgs.errors import UserError
-from wildgs.scene.images import MAX_IMAGE_PIXELS
-from wildgs.sfm.pairs import Pairing, PairingConfig, choose_pairs
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.pairs import Pairing, choose_pairs
 from wildgs.sfm.upright import WorkingCopy
 
 Progress = Callable[[str, int, int], None]
@@ -22,24 +22,6 @@ Progress = Callable[[str, int, int], None]
 EXTRACTION_BATCH = 16
 MATCHING_BLOCK = 50
 """Photos per block of pairs: COLMAP keeps the features of two blocks in memory."""
-
-
-@dataclass(frozen=True)
-class SfmConfig:
-    """Structure from motion."""
-
-    pairing: PairingConfig = field(default_factory=PairingConfig)
-    """Which photos are matched with which."""
-    max_image_size: int = 2000
-    """Features are sought at no more than this many pixels on the long side."""
-    max_features: int = 8192
-    """Features per photo."""
-    max_image_pixels: int = MAX_IMAGE_PIXELS
-    """Photos with more pixels are left out."""
-    threads: int = -1
-    """CPU threads; -1 = all."""
-    seed: int = 0
-    """Of the random choices of matching and mapping."""
 
 
 @dataclass(frozen=True)

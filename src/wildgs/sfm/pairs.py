@@ -19,6 +19,8 @@ from jaxtyping import Float, Shaped
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from wildgs.sfm.config import PairingConfig
+
 PairingName = Literal["exhaustive", "gps", "retrieval"]
 
 EARTH_RADIUS = 6_371_000.0
@@ -27,20 +29,6 @@ VLAD_FEATURES = 1000
 """Descriptors per photo that retrieval looks at."""
 VLAD_TRAINING = 100_000
 """Descriptors, over all photos, from which the words are learned."""
-
-
-@dataclass(frozen=True)
-class PairingConfig:
-    """When and how partners are chosen."""
-
-    exhaustive_limit: int = 200
-    """Sets of up to this many photos are matched all with all."""
-    neighbours: int = 40
-    """Partners per photo in larger sets."""
-    gps_share: float = 0.8
-    """Share of the photos that must carry a GPS position for neighbours to be chosen by it."""
-    gps_distance: float = 200.0
-    """Photos farther apart than this, in metres, are no neighbours by GPS."""
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from pathlib import Path, PurePosixPath
 from PIL import Image
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.images import (
     EXIF_ORIENTATION,
-    MAX_IMAGE_PIXELS,
     UnreadableImageError,
     open_image,
     read_photo,

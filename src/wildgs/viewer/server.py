@@ -6,34 +6,17 @@ import contextlib
 import importlib
 import io
 import socket
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wildgs.errors import UserError
+from wildgs.viewer.config import LOCAL, ServerConfig
 
 if TYPE_CHECKING:
     import viser
 
-LOCAL = "127.0.0.1"
 REMEDY = "the viewer needs viser: pip install 'wildgs[viewer]'"
-
-
-@dataclass(frozen=True)
-class ServerConfig:
-    """Where the viewer is reached.
-
-    Attributes:
-        host: Address to listen on. The default lets this machine in and no other; 0.0.0.0 lets everyone in who can
-            reach this machine, who then sees the photos and can use its processor.
-        port: Port to listen on; the next free one where it is taken.
-        share: Also make a public address through viser's own relay: everyone who has it can look.
-    """
-
-    host: str = LOCAL
-    port: int = 8080
-    share: bool = False
 
 
 def open_server(config: ServerConfig, title: str) -> viser.ViserServer:

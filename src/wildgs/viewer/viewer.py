@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +21,7 @@ from wildgs.model.gaussians import NEAR
 from wildgs.scene import Scene, View
 from wildgs.viewer.cameras import ViserCamera, pose_of
 from wildgs.viewer.comparison import compare
+from wildgs.viewer.config import ViewerConfig
 from wildgs.viewer.display import Paint, SplatDisplay
 from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.gallery import Gallery, spread
@@ -41,17 +41,6 @@ REPAINT_DISTANCE = 0.01
 """In the photos' usual depth; a shorter way changes no direction by more than about half a degree."""
 FAR = 1000.0
 PAINTS: tuple[Paint, ...] = ("colour", "depth")
-
-
-@dataclass(frozen=True)
-class ViewerConfig:
-    """What is shown.
-
-    Attributes:
-        photos: How many photos are offered as thumbnails and frustums; more are reached by name.
-    """
-
-    photos: int = 48
 
 
 class Viewer:

@@ -1,0 +1,127 @@
+"""Configuration of training: plain dataclasses, importable without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from wildgs.errors import UserError
+from wildgs.losses.config import ObjectiveConfig
+from wildgs.model.config import Precision
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """Steps are the paper's, of 30,000; a run of another length scales them (floors keep short runs sane).
+
+    Attributes:
+        first_stage: Steps without triplane and depth loss, until the mask is useful.
+        densify_from: First densification (3DGS: 500).
+        densify_until: Last densification and reset (3DGS: 15,000).
+        densify_every: Between densifications (3DGS: 100).
+        reset_every: Between opacity resets (3DGS: 3,000).
+        mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
+            like a transient.
+        sh_every: Between raises of the active SH degree (3DGS: 1,000).
+        encoder_every: The photo's encoder learns on one step in so many (not scaled; paper: 1).
+    """
+
+    first_stage: int = 3000
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    reset_every: int = 3000
+    mask_pause: int = 500
+    sh_every: int = 1000
+    encoder_every: int = 2
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Learning rates. Those of the Gaussians are 3DGS's.
+
+    Attributes:
+        means: Position, at the start, per unit of scene extent.
+        means_final: Position, at the end, per unit of scene extent.
+        scales: Logarithms of the scales.
+        quats: Orientations.
+        opacities: Opacity logits.
+        sh0: Flat colour (3dgs only).
+        shN: Higher harmonics (3dgs only).
+        intrinsic: Intrinsic features (wildgs only).
+        networks: All networks but the encoder, at the start.
+        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
+            thousand steps, and the embedding of every photo becomes the same.
+        network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
+        batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
+            rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
+    """
+
+    means: float = 1.6e-4
+    means_final: float = 1.6e-6
+    scales: float = 5e-3
+    quats: float = 1e-3
+    opacities: float = 5e-2
+    sh0: float = 2.5e-3
+    shN: float = 1.25e-4  # noqa: N815 - the field's name
+    intrinsic: float = 2.5e-3
+    networks: float = 1e-3
+    encoder: float = 1e-4
+    network_decay: float = 0.1
+    batch_scaling: Literal["sqrt", "none"] = "sqrt"
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Clone, split, prune, reset. Values are 3DGS's.
+
+    Attributes:
+        grow_gradient: Mean screen gradient above which a Gaussian grows, per half picture (3DGS's normalised
+            device coordinates).
+        split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
+        prune_opacity: Fainter Gaussians go.
+        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before. Beyond
+            the extent it is a share of their distance from the middle: what is far may be as large.
+        prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
+            of them float right before a camera and stand for what stood in its way.
+        reset_opacity: Opacities are lowered to this at a reset.
+        max_gaussians: No growth beyond this number.
+    """
+
+    grow_gradient: float = 2e-4
+    split_scale: float = 0.01
+    prune_opacity: float = 0.005
+    prune_scale: float = 0.1
+    prune_reach: float = 0.15
+    reset_opacity: float = 0.01
+    max_gaussians: int = 3_000_000
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Training.
+
+    Attributes:
+        steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
+        seed: Of everything random.
+        precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
+        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+        objective: Loss weights.
+        schedule: What happens when.
+        optimizer: Learning rates.
+        density: Densification and pruning.
+    """
+
+    steps: int = 30_000
+    seed: int = 0
+    precision: Precision = "auto"
+    cuda_graphs: bool = True
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+    def __post_init__(self) -> None:
+        """Refuses a run without a step."""
+        if self.steps < 1:
+            raise UserError(f"steps {self.steps}: must be 1 or more")

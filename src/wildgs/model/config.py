@@ -1,0 +1,130 @@
+"""Configuration of Wild-GS: plain dataclasses, importable without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from wildgs.priors.config import DepthPointsConfig, GroundConfig
+
+RESNET18 = "microsoft/resnet-18"
+
+Precision = Literal["auto", "float32", "bfloat16"]
+MethodName = Literal["wildgs", "3dgs"]
+Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
+"""Parts that can be taken away: the paper's five, and the intrinsic and local features."""
+
+
+@dataclass(frozen=True)
+class ParsingConfig:
+    """2D Parsing.
+
+    Attributes:
+        encoder: ResNet-18's folder or hub name.
+        max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
+            anyway, and cost grows with the square.
+        color_statistics: Whether M^G also reads mean and spread of the photo's own colours. Not in the paper; but
+            what five stages leave of a photo says little of its colour cast.
+        global_size: Length of the global embedding (paper: 16).
+        decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
+    """
+
+    encoder: str = RESNET18
+    max_side: int = 256
+    color_statistics: bool = True
+    global_size: int = 16
+    decoder_widths: tuple[int, int, int] = (128, 64, 32)
+
+
+@dataclass(frozen=True)
+class WrappingConfig:
+    """3D Wrapping.
+
+    Attributes:
+        resolution: Cells per side of a plane.
+        features: Channels of a plane's feature map.
+        widths: Channels of the plane UNet, from full resolution down.
+        local_size: Length of the local embedding (paper: 16).
+        crop_ratio: Share of the robust box's sides that the triplane covers (paper: 0.5).
+        box_quantile: Share of SfM points outside the robust box on each side of each axis.
+        partial_lifts: Share of the training steps in which a part of the photo is lifted only. Not in the paper,
+            where every Gaussian that is seen finds its own pixels in the planes, and those that a photo does not
+            show get whatever light comes out.
+    """
+
+    resolution: int = 128
+    features: int = 32
+    widths: tuple[int, ...] = (16, 32, 64, 64)
+    local_size: int = 16
+    crop_ratio: float = 0.5
+    box_quantile: float = 0.005
+    partial_lifts: float = 0.5
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """The fusion network.
+
+    Attributes:
+        intrinsic_size: Length of the intrinsic feature (paper: 32).
+        hidden: Width of the two hidden layers.
+        sh_degree: Degree of the predicted spherical harmonics (paper: 3, as 3DGS has).
+        output_scale: Factor on the output layer's initial weights.
+        color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
+            exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
+    """
+
+    intrinsic_size: int = 32
+    hidden: int = 64
+    sh_degree: int = 1
+    output_scale: float = 0.1
+    color_transform: bool = True
+
+
+@dataclass(frozen=True)
+class SkyConfig:
+    """The shell of Gaussians that stands for the sky at the start.
+
+    Attributes:
+        points: How many; 0 leaves the sky to densification, as the paper does.
+        radius: Of the shell, in units of the aligned frame (photos' median depth); more where the scene's points
+            reach further.
+        reach: The shell lies at this multiple of the distance within which nearly all points are, at least.
+        lowest: Elevation at which the shell ends, degrees. Below the horizon it closes the scene behind ground that
+            too few photos show: such holes are as dark as the background otherwise.
+        opacity: Of its Gaussians at the start.
+    """
+
+    points: int = 5000
+    radius: float = 10.0
+    reach: float = 2.0
+    lowest: float = -90.0
+    opacity: float = 0.5
+
+
+@dataclass(frozen=True)
+class WildGSConfig:
+    """The model.
+
+    Attributes:
+        without: Parts left out, for ablations.
+        mask_threshold: Th: pixels above it are static (lifting, depth loss).
+        parsing: 2D Parsing.
+        wrapping: 3D Wrapping.
+        fusion: The fusion network.
+        depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.
+        ground: Gaussians that continue the ground at the start.
+        sky: Gaussians that stand for the sky at the start.
+        color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
+            scene's colours under that are from the photo's. Not in the paper.
+    """
+
+    without: tuple[Ablation, ...] = ()
+    mask_threshold: float = 0.5
+    parsing: ParsingConfig = field(default_factory=ParsingConfig)
+    wrapping: WrappingConfig = field(default_factory=WrappingConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
+    ground: GroundConfig = field(default_factory=GroundConfig)
+    sky: SkyConfig = field(default_factory=SkyConfig)
+    color_match: bool = True
