@@ -63,7 +63,9 @@ def test_where_nothing_is_writable_a_temporary_folder_serves_with_one_warning(
     try:
         with pytest.warns(WildGSWarning, match="NUMBA_CACHE_DIR"):
             first = kernel_cache.cache_folder(tmp_path / "a")
-        assert kernel_cache.cache_folder(tmp_path / "b") == first, "no second warning, which would be an error"
+        assert kernel_cache.cache_folder(tmp_path / "b") == first, (
+            "no second warning, which would be an error"
+        )
         assert first is not None
         assert writable(first)
     finally:

@@ -156,9 +156,12 @@ def test_streams_are_overridden_while_recording_alone(monkeypatch: pytest.Monkey
     said: list[object] = []
     monkeypatch.setattr(torch.autograd.graph, "set_override_stale_capture_stream", said.append, raising=False)
     record, recorded = recorder()
-    monkeypatch.setattr(
-        torch.cuda, "make_graphed_callables", lambda *a, **k: said.append("record") or record(*a, **k)
-    )
+
+    def records(*arguments, **keywords):
+        said.append("record")
+        return record(*arguments, **keywords)
+
+    monkeypatch.setattr(torch.cuda, "make_graphed_callables", records)
     replays = Replays()
     replays.switch(True)
     for _ in range(EAGER_CALLS + 2):
