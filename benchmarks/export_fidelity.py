@@ -27,7 +27,7 @@ from wildgs.export.formats import SplatFormat, write_splats
 from wildgs.export.page_scene import pack_scene
 from wildgs.export.splats import Splats
 from wildgs.geometry.camera import Camera
-from wildgs.geometry.sh_cut import cut_sh, fit_cut
+from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
 from wildgs.model.gaussians import NEAR
 from wildgs.rasterize import rasterize
 from wildgs.scene import View
@@ -79,11 +79,15 @@ def print_degrees(
         f"\n{'page, degree':16}{'bytes a splat':>15}{'dB fitted':>12}{'dB cut':>10}   ({len(lights)} lights)"
     )
     for degree in range(whole.sh_degree + 1):
-        fit = fit_cut(whole.means, viewpoints, whole.sh_degree, degree) if degree < whole.sh_degree else None
-        packed = pack_scene(whole, [cut_sh(sh, degree, fit).numpy() for sh in lights])
+        fit = (
+            fit_truncation(whole.means, viewpoints, whole.sh_degree, degree)
+            if degree < whole.sh_degree
+            else None
+        )
+        packed = pack_scene(whole, [truncate_sh(sh, degree, fit).numpy() for sh in lights])
         costs = []
         for matrix in (fit, None):
-            cut = whole.with_sh(cut_sh(whole.sh, degree, matrix))
+            cut = whole.with_sh(truncate_sh(whole.sh, degree, matrix))
             costs.append(pooled(original, [picture(cut, view.camera) for view in views]))
         print(f"{degree:<16}{len(packed.data) / len(whole):15.1f}{costs[0]:12.2f}{costs[1]:10.2f}")
 

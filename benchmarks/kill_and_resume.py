@@ -23,7 +23,7 @@ from typing import Any
 
 import tyro
 
-from demo_generator import SyntheticConfig, make_landmark
+from resized_demo import write_resized_demo
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.model.registry import MethodName
 
@@ -123,8 +123,7 @@ def main(command: Command) -> int:
 
 
 def _run(command: Command, folder: Path) -> int:
-    scene = folder / "scene"
-    make_landmark(scene, SyntheticConfig(photos=9, test_every=4, long_side=48, points=800, least_views=2))
+    scene = write_resized_demo(folder / "scene", photos=9, long_side=48, points=500)
     seconds = _train(command, scene, folder / "a", None, None)
     _train(command, scene, folder / "b", None, None)
     wanted, step = _final(folder / "a")

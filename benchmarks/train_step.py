@@ -32,7 +32,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from demo_generator import SyntheticConfig, make_landmark
+from resized_demo import write_resized_demo
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
@@ -168,7 +168,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 def make_scene(folder: Path, long_side: int, photos: int = PHOTOS) -> Scene:
     """The demo's landmark."""
-    make_landmark(folder, SyntheticConfig(photos=photos, long_side=long_side))
+    write_resized_demo(folder, photos=photos, long_side=long_side)
     return load_scene(folder, DataConfig(holdout=0))
 
 

@@ -127,7 +127,7 @@ def main(command: Command) -> None:
     server = open_server(ServerConfig(port=0), "benchmark")
     viewer = Viewer(server, subject, ViewerConfig())
     protocol = f"viser-v{viser.__version__}"
-    address = f"ws://127.0.0.1:{server.get_port()}"
+    address = f"ws://127.0.0.1:{server.get_port()}/{server.access.token}"
     audience = subprocess.Popen([sys.executable, "-c", AUDIENCE, address, protocol])
     turns = TrainingTurns(viewer.jobs, lambda: audience.poll() is None, lambda _: viewer.ask_for_update())
     alternation = Alternation(turns, viewer, command)

@@ -1,4 +1,4 @@
-"""The demo's landmark: a made-up place that tourists photograph at every hour, generated in code."""
+"""The generator of the demo's scene: a made-up landmark that tourists photograph at every hour."""
 
 from demo_generator.photos import SyntheticConfig, make_landmark
 

@@ -23,6 +23,7 @@ from demo_generator.transients import draw_visitors
 _LIGHTS = ("slant", "golden", "noon", "slant", "dusk", "noon", "slant", "golden", "overcast", "slant")
 _GOLDEN_RATIO = 0.6180339887498949
 _PLACE_SEED = 3
+_DISPARITY_STEP = 16  # 12 of the 16 bits: the others hold noise, which does not compress
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class SyntheticConfig:
 
     photos: int = 40
     test_every: int = 7
-    long_side: int = 320
+    long_side: int = 240
     samples: int = 2
     points: int = 6000
     least_views: int = 3
@@ -136,14 +137,18 @@ def _take_photo(index: int, place: _Place, config: SyntheticConfig, output: Path
     gain = metered_gain(shot.radiance)
     pixels = develop(shot.radiance, gain, response, seed=index)
     name = f"landmark_{index:02d}"
-    Image.fromarray(pixels).save(output / "images" / f"{name}.jpg", quality=92, subsampling=0)
-    Image.fromarray(disparity_prior(shot.depth, rng)).save(output / "depth" / f"{name}.png")
+    Image.fromarray(pixels).save(output / "images" / f"{name}.jpg", quality=92, subsampling=0, optimize=True)
+    _write_png(disparity_prior(shot.depth, rng), output / "depth" / f"{name}.png")
     mask = np.where(shot.visitor, 0, 255).astype(np.uint8)
-    Image.fromarray(mask).save(output / "truth" / "masks" / f"{name}.png")
+    _write_png(mask, output / "truth" / "masks" / f"{name}.png")
     if _split(index, config) == "test":
         clean = develop(shoot(Solids().build()).radiance, gain, response, seed=index)
-        Image.fromarray(clean).save(output / "truth" / "clean" / f"{name}.png")
+        _write_png(clean, output / "truth" / "clean" / f"{name}.png")
     return Photo(f"{name}.jpg", view, pixels, shot.depth.astype(np.float32), shot.visitor)
+
+
+def _write_png(pixels: np.ndarray, file: Path) -> None:
+    Image.fromarray(pixels).save(file, optimize=True)
 
 
 def _shoot(
@@ -165,4 +170,5 @@ def disparity_prior(depth: Float[np.ndarray, "H W"], rng: np.random.Generator) -
     error = np.asarray(coarse.resize((depth.shape[1], depth.shape[0]), Image.Resampling.BICUBIC), dtype=float)
     largest = np.percentile(disparity[solid], 99.5) if solid.any() else 1.0
     value = disparity / largest * (1.0 + error) * rng.uniform(0.6, 0.92) + rng.uniform(0.01, 0.06)
-    return np.where(solid, np.clip(np.round(value * 65535.0), 1, 65535), 0).astype(np.uint16)
+    stored = np.round(value * (65535.0 / _DISPARITY_STEP)) * _DISPARITY_STEP
+    return np.where(solid, np.clip(stored, _DISPARITY_STEP, 65535), 0).astype(np.uint16)

@@ -13,6 +13,7 @@ from demo_generator.cameras import Viewpoint
 
 _DEPTH_TOLERANCE = 0.01  # share of the depth by which a point seen elsewhere may miss the surface
 _LONGEST_TRACK = 12
+_PIXEL_STEP, _METRE_STEP = 1 / 32, 1 / 1024  # what is stored, far below the errors: short numbers compress
 
 
 @dataclass(frozen=True)
@@ -136,4 +137,9 @@ def _track(
     moved = position + rng.normal(0.0, 0.4 * float(np.median(size)), 3)
     colors = [photos[i].pixels[int(p[1]), int(p[0])] for i, p in zip(seen_by, exact, strict=True)]
     color = np.mean(colors, axis=0).round().astype(np.uint8)
-    return SparsePoint(moved, color, seen_by, pixels)
+    return SparsePoint(
+        np.round(moved / _METRE_STEP) * _METRE_STEP,
+        color,
+        seen_by,
+        np.round(pixels / _PIXEL_STEP) * _PIXEL_STEP,
+    )

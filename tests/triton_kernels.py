@@ -1,4 +1,4 @@
-"""Compares Triton kernels with the CPU backend, by Triton's interpreter; run by test_triton in a process of its own."""
+"""Compares Triton kernels with the CPU's, by Triton's interpreter; test_triton runs it in a process of its own."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A device that says it is CUDA and computes on the CPU: counts what a GPU would be told to do, without one.
 
 Tensors on it are real, so whole training steps run, and it counts how many kernels a step launches and where the
-host waits for the device. It says nothing about times, streams, graph capture or gsplat's own interface; tests check
+host waits for the device. It says nothing about times, streams, graph capture or gsplat's interface; tests check
 those against torch and the installed gsplat.
 
     import pretend_cuda

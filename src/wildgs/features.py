@@ -30,7 +30,7 @@ def is_on(name: str) -> bool:
 
 
 def has_triton(name: str) -> bool:
-    """Whether a feature is on that needs Triton, which torch's CUDA builds for Linux bring, and an Ampere or newer GPU."""
+    """Whether a feature is on that needs Triton (in torch's CUDA builds for Linux) and an Ampere or newer GPU."""
     return is_on(name) and _runs_triton()
 
 

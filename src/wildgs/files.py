@@ -1,4 +1,4 @@
-"""Reading and writing files: atomic writes, and regular files only."""
+"""Reading and writing files: atomic writes, regular files only, and file names as text."""
 
 from __future__ import annotations
 
@@ -98,3 +98,19 @@ def check_regular(path: Path) -> None:
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError("not a regular file")
+
+
+def printable(name: str) -> str:
+    r"""A file's name as text that every screen, page and text file can hold.
+
+    Names are bytes on most systems. Bytes that are not UTF-8 and characters that do not print (control characters,
+    reversed writing) are shown as escapes such as `\xe9`.
+    """
+    return "".join(character if character.isprintable() else _escaped(character) for character in name)
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # how Python holds a byte that is not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return character.encode("unicode_escape").decode("ascii")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ import yaml
 from PIL import Image
 
 from wildgs.cli import VERBS
+from wildgs.scene import demo
 
 
 def complaint(capsys: pytest.CaptureFixture[str]) -> str:
@@ -62,9 +64,13 @@ def test_resume_does_nothing_more_to_a_finished_run(trained: Path, wildgs, landm
     assert (trained / "checkpoints" / "step_00000040.safetensors").read_bytes() == before
 
 
-def test_demo_ends_with_a_page(wildgs, tmp_path: Path, landmark: Path) -> None:
+def test_demo_ends_with_a_page(
+    wildgs, tmp_path: Path, landmark: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = Path(shutil.make_archive(str(tmp_path / "small"), "zip", landmark))
+    monkeypatch.setattr(demo, "ARCHIVE", small)
     output = tmp_path / "demo"
-    assert wildgs("demo", "--output", output, "--steps", 20, "--photos", 8, "--long-side", 48) == 0
+    assert wildgs("demo", "--output", output, "--steps", 20) == 0
     page = (output / "report.html").read_text()
     assert "3DGS" in page
     assert "Wild-GS" in page

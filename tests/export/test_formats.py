@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from wildgs.errors import UserError
-from wildgs.export.formats import write_splats
-from wildgs.export.ply import ply_bytes
+from wildgs.export.formats import ply_bytes, write_splats
 from wildgs.export.splats import Splats
 
 gaussforge = pytest.importorskip("gaussforge")

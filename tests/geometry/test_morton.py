@@ -4,12 +4,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wildgs.geometry.morton import BITS, _spread, morton_order
+from wildgs.geometry.morton import MAX_BITS, _spread, morton_order
 
 
-@given(st.integers(0, 2**BITS - 1))
+@given(st.integers(0, 2**MAX_BITS - 1))
 def test_bits_are_spread(number: int):
-    wanted = sum(((number >> bit) & 1) << (3 * bit) for bit in range(BITS))
+    wanted = sum(((number >> bit) & 1) << (3 * bit) for bit in range(MAX_BITS))
     assert int(_spread(torch.tensor(number))) == wanted
 
 

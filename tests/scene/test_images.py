@@ -1,3 +1,4 @@
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,12 @@ from PIL import Image
 from wildgs.scene.images import (
     ShapeMismatchError,
     UnreadableImageError,
+    open_image,
     read_disparity,
     read_mask,
     read_photo,
     same_shape,
+    upright_size,
 )
 
 W, H = 40, 24
@@ -30,6 +33,41 @@ ORIENTED = {
     7: lambda a: np.rot90(np.transpose(a, (1, 0, 2)), 2),
     8: lambda a: np.rot90(a, 1),
 }
+
+
+def exif_of(entries: list[tuple[int, int, int, bytes]]) -> bytes:
+    """An EXIF block, byte by byte: tag, type, count and four bytes of value."""
+    block = struct.pack("<2sHIH", b"II", 42, 8, len(entries))
+    block += b"".join(struct.pack("<HHI4s", *entry) for entry in entries)
+    return b"Exif\0\0" + block + struct.pack("<I", 0)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        (0x011A, 2, 4, b"72a\0"),  # XResolution as text
+        (0x0100, 8, 1, struct.pack("<hH", -5, 0)),  # ImageWidth as a signed short
+        (0x010F, 7, 4, b"\xff\xfe\0\x01"),  # Make as undefined bytes
+        (0x011A, 5, 1, b"\xff\xff\xff\xff"),  # a rational number beyond the end
+        (0x8769, 4, 1, b"\x08\0\0\0"),  # an EXIF block that contains itself
+    ],
+)
+def test_odd_exif_entries_do_not_matter(tmp_path: Path, entry: tuple[int, int, int, bytes]) -> None:
+    """Orientation 6 and one entry that Pillow can read, but not write again."""
+    path = tmp_path / "a.jpg"
+    oriented = (0x0112, 3, 1, struct.pack("<HH", 6, 0))
+    Image.fromarray(gradient()).save(path, exif=exif_of([entry, oriented]), quality=95)
+    expected = np.rot90(gradient(), -1).astype(float)
+    assert np.abs(read_photo(path).pixels - expected).mean() < 4
+
+
+def test_tiffs_are_turned_once(tmp_path: Path) -> None:
+    """Pillow turns them while it loads them."""
+    path = tmp_path / "a.tif"
+    Image.fromarray(gradient()).save(path, tiffinfo={0x0112: 6})
+    np.testing.assert_array_equal(read_photo(path).pixels, np.rot90(gradient(), -1))
+    with open_image(path) as image:
+        assert upright_size(image) == (H, W)
 
 
 def save_oriented(path: Path, orientation: int) -> Path:

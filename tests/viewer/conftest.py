@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import base64
+import http.server
 import itertools
 import json
 import shutil
+import struct
 import subprocess
 import threading
 import time
 import urllib.request
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -45,6 +48,20 @@ def _view(name: str, camera: Camera, split, photo: torch.Tensor) -> View:
         read_clean=lambda: None,
         read_truth_mask=lambda: None,
     )
+
+
+@pytest.fixture(scope="session")
+def huge_picture() -> bytes:
+    """A PNG of 240 megapixels in 230 kB, written by hand: encoding it from pixels would take their memory."""
+    width, height = 20_000, 12_000
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    compress, row = zlib.compressobj(9), bytes(1 + (width + 7) // 8)
+    pixels = b"".join([*(compress.compress(row) for _ in range(height)), compress.flush()])
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
 @pytest.fixture(scope="session")
@@ -203,3 +220,34 @@ def browse(tmp_path: Path) -> Iterator[Callable[[str], Browser]]:
     yield browse
     for browser in opened:
         browser.close()
+
+
+@pytest.fixture
+def foreign_site() -> Iterator[Callable[[str], str]]:
+    """Serves a page from another origin; gives its address."""
+    pages: dict[str, bytes] = {}
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = pages.get(self.path, b"")
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+
+    def serve(page: str) -> str:
+        pages["/page.html"] = page.encode()
+        return f"http://localhost:{server.server_port}/page.html"
+
+    yield serve
+    server.shutdown()
+    server.server_close()
+    thread.join(20)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,6 +82,14 @@ def settled(viewer: Viewer) -> np.ndarray:
     return seen[-1]
 
 
+def send(page: Any, picture: Path) -> None:
+    """Drops a file on the page."""
+    wait_for(lambda: page.evaluate("document.querySelectorAll('input[type=file]').length") == 1)
+    root = page.call("DOM.getDocument")["root"]["nodeId"]
+    node = page.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
+    page.call("DOM.setFileInputFiles", files=[str(picture)], nodeId=node)
+
+
 def test_page_draws_what_the_rasteriser_draws(
     viewer: Viewer, subject: Subject, browse: Callable, tmp_path: Path
 ) -> None:
@@ -128,7 +137,71 @@ def test_a_dropped_picture_gives_its_light(
     page = browse(address(viewer.server, ServerConfig()))
     wait_for(lambda: page.evaluate("document.querySelectorAll('input[type=file]').length") == 1)
     assert page.evaluate("document.querySelector('input[type=file]').getBoundingClientRect().height") > 30
-    root = page.call("DOM.getDocument")["root"]["nodeId"]
-    node = page.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
-    page.call("DOM.setFileInputFiles", files=[str(picture)], nodeId=node)
+    send(page, picture)
     wait_for(lambda: viewer.lighting.desk.first.label == "evening.png")
+
+
+def test_a_picture_that_cannot_be_used_is_no_success(
+    viewer: Viewer, subject: Subject, browse: Callable, tmp_path: Path
+) -> None:
+    before = viewer.lighting.desk
+    picture = tmp_path / "broken.png"
+    picture.write_bytes(b"no picture" * 100)
+    page = browse(address(viewer.server, ServerConfig()))
+    send(page, picture)
+    text = "document.body.innerText"
+    wait_for(lambda: "Upload failed" in page.evaluate(text))
+    time.sleep(1)
+    assert "not a readable picture" in page.evaluate(text)
+    assert "successfully" not in page.evaluate(text)
+    assert "Uploading" not in page.evaluate(text)
+    assert viewer.lighting.desk.first == before.first or "broken" not in viewer.lighting.desk.first.label
+    good = tmp_path / "evening.png"
+    Image.fromarray(np.full((30, 40, 3), (250, 120, 20), dtype=np.uint8)).save(good)
+    send(page, good)
+    wait_for(lambda: viewer.lighting.desk.first.label == "evening.png")
+    wait_for(lambda: "uploaded successfully" in page.evaluate(text))
+
+
+FOREIGN_PAGE = """
+<title>waiting</title><pre id=log></pre><script>
+const log = [], base = "127.0.0.1:PORT", tokens = ["", "TOKEN"];
+const attempts = [];
+for (const token of tokens) {
+  for (const mode of ["cors", "no-cors"])
+    attempts.push(fetch(`http://${base}/${token}`, {mode})
+      .then(r => r.text().then(t => log.push(`fetch ${r.type} ${r.status} ${t.length}`)))
+      .catch(() => log.push("fetch failed")));
+  attempts.push(new Promise(done => {
+    const socket = new WebSocket(`ws://${base}/${token}`, ["viser-vVERSION"]);
+    socket.onopen = () => { log.push("OPEN"); done(); };
+    socket.onmessage = () => log.push("MESSAGE");
+    socket.onerror = () => { log.push("socket refused"); done(); };
+  }));
+}
+Promise.all(attempts).then(() => setTimeout(() => {
+  document.getElementById("log").textContent = log.join("\\n"); document.title = "done"; }, 1000));
+</script>
+"""
+
+
+def test_a_page_of_another_site_gets_nothing(
+    viewer: Viewer, browse: Callable, foreign_site: Callable
+) -> None:
+    """Not even if it knew the token."""
+    import viser
+
+    port = viewer.server.get_port()
+    html = FOREIGN_PAGE.replace("PORT", str(port)).replace("VERSION", viser.__version__)
+    page = browse(foreign_site(html.replace("TOKEN", viewer.server.access.token)))
+    wait_for(lambda: page.evaluate("document.title") == "done")
+    log = page.evaluate("document.getElementById('log').textContent").splitlines()
+    assert sorted(set(log)) == ["fetch failed", "fetch opaque 0 0", "socket refused"] or sorted(set(log)) == [
+        "fetch failed",
+        "socket refused",
+    ]
+    assert log.count("socket refused") == 2
+    assert viewer.server.get_clients() == {}
+    own = browse(address(viewer.server, ServerConfig()))
+    wait_for(viewer.server.get_clients)
+    assert own.evaluate("document.querySelectorAll('canvas').length") > 0

@@ -50,34 +50,35 @@ def test_a_chosen_light_is_seen_at_once() -> None:
     "name", ["../../etc/passwd", "C:\\temp\\a.png", "/x", "a\x00b.png", "é" * 300, "", ".."]
 )
 def test_uploads_stay_in_their_folder(tmp_path: Path, name: str) -> None:
-    file = store_upload(tmp_path, 3, name, b"picture")
-    assert file.parent == tmp_path
-    assert file.read_bytes() == b"picture"
+    file = store_upload(tmp_path, 3, name, png(Image.new("RGB", (8, 6), (1, 2, 3))))
+    assert list(tmp_path.iterdir()) == [file]
+    with Image.open(file) as stored:
+        assert (stored.size, stored.getpixel((0, 0))) == ((8, 6), (1, 2, 3))
     assert len(file.name) < 60
     assert file.name.isascii()
 
 
-def test_empty_upload_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="empty"):
-        store_upload(tmp_path, 1, "a.jpg", b"")
+def png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture"])
+def test_what_is_no_picture_is_one_line_and_leaves_nothing(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(UserError, match="not a readable picture"):
+        store_upload(tmp_path, 1, "a.jpg", content)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_any_picture_can_lend_its_light(subject: Subject, tmp_path: Path) -> None:
     lit = []
     for number, value in enumerate((20, 200)):
         picture = Image.fromarray(np.full((40, 60, 3), value, dtype=np.uint8))
-        buffer = io.BytesIO()
-        picture.save(buffer, format="PNG")
-        file = store_upload(tmp_path, number, "mine.png", buffer.getvalue())
+        file = store_upload(tmp_path, number, "mine.png", png(picture))
         light = Light(str(file), "mine.png", subject.views[0].name)
         lit.append(LightDesk(light, DARK).look(subject).sh)
     assert not torch.allclose(lit[0], lit[1])
-
-
-def test_what_is_no_picture_is_one_line(subject: Subject, tmp_path: Path) -> None:
-    file = store_upload(tmp_path, 1, "mine.png", b"no picture")
-    with pytest.raises(UserError, match="not a readable picture"):
-        LightDesk(Light(str(file), "mine.png", subject.views[0].name), DARK).look(subject)
 
 
 def test_most_different_photo() -> None:

@@ -15,7 +15,7 @@ from wildgs.scene import Scene
 from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.lighting import Light, LightDesk
-from wildgs.viewer.recording import RecordingPanel
+from wildgs.viewer.recording import MAX_VIEWS, RecordingPanel
 from wildgs.viewer.server import ServerConfig, open_server
 from wildgs.viewer.subject import Subject
 
@@ -56,8 +56,26 @@ def test_a_view_is_the_camera_at_the_moment(panel: RecordingPanel, wall: Scene) 
 
 def test_a_path_of_one_view_is_refused_in_one_line(panel: RecordingPanel, wall: Scene) -> None:
     panel.add(pose_of(wall.views[0].camera))
-    with pytest.raises(UserError, match="two views"):
+    with pytest.raises(UserError, match="at least two views"):
         panel.order()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "height"), [(1e7, "480"), (float("nan"), "480"), (0.0, "480"), (6.0, "30000")]
+)
+def test_videos_are_bounded(panel: RecordingPanel, wall: Scene, seconds: float, height: str) -> None:
+    """Whatever a browser set the controls to."""
+    for view in wall.views[:2]:
+        panel.add(pose_of(view.camera))
+    panel._seconds._impl.value, panel._height._impl.value = seconds, height
+    with pytest.raises(UserError, match="up to 60 seconds"):
+        panel.order()
+
+
+def test_paths_are_bounded(panel: RecordingPanel, wall: Scene) -> None:
+    for _ in range(MAX_VIEWS + 3):
+        panel.add(pose_of(wall.views[0].camera))
+    assert len(panel._markers) == len(panel.order().keyframes) == MAX_VIEWS
 
 
 def test_video_goes_along_the_path_under_changing_light(

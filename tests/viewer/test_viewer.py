@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import io
+import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from wildgs.engine.trainer import Trainer
+from wildgs.errors import UserError
 from wildgs.scene import Scene
 from wildgs.viewer.cameras import Pose
+from wildgs.viewer.lighting import KEPT_UPLOADS, UPLOAD_SIDE, Light
 from wildgs.viewer.server import ServerConfig, open_server
 from wildgs.viewer.splats import colors_from
 from wildgs.viewer.subject import Subject, TrainingSubject
 from wildgs.viewer.viewer import Viewer, ViewerConfig
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+
+import msgspec
 
 
 def work_off(viewer: Viewer) -> None:
@@ -128,21 +137,58 @@ def test_visiting_a_photo_shows_it_beside_its_render(viewer: Viewer, wall: Scene
     assert viewer.photos._choice.value == wall.views[5].name
 
 
+def test_a_picture_that_cannot_be_used_changes_nothing(viewer: Viewer) -> None:
+    before, desk = colors(viewer), viewer.lighting.desk
+    for content in (b"no picture", b""):
+        with pytest.raises(UserError, match="not a readable picture"):
+            viewer.lighting.take_picture("mine.jpg", content)
+    work_off(viewer)
+    assert viewer.lighting.desk == desk, "the light before stays chosen"
+    np.testing.assert_array_equal(colors(viewer), before)
+
+
 def test_a_light_that_cannot_be_is_a_message_and_nothing_else(
     viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
     monkeypatch.setattr(viewer, "complain", said.append)
-    viewer.lighting._complain = said.append
-    before = colors(viewer)
-    viewer.lighting.take_picture("mine.jpg", b"no picture")
+    before, desk = colors(viewer), viewer.lighting.desk
+    viewer.lighting.choose(Light("gone.jpg", "gone.jpg"))
     work_off(viewer)
-    viewer.lighting.take_picture("empty.jpg", b"")
-    assert len(said) == 2
-    assert "mine" not in viewer.lighting.desk.first.label, "the light before stays chosen"
-    assert "not a readable picture" in said[0]
-    assert "empty" in said[1]
+    assert viewer.lighting.desk == desk
+    assert "gone.jpg" in said[0]
     np.testing.assert_array_equal(colors(viewer), before)
+
+
+def test_numbers_from_browsers_are_bounded(viewer: Viewer) -> None:
+    desk = viewer.lighting.desk
+    viewer.lighting.set_amount(float("nan"))
+    assert viewer.lighting.desk == desk
+    viewer.lighting.set_amount(1e9)
+    assert viewer.lighting.desk.amount == 1.0
+
+
+def test_few_uploads_are_kept(viewer: Viewer) -> None:
+    content = io.BytesIO()
+    Image.new("RGB", (3000, 20), (200, 90, 30)).save(content, "PNG")
+    for _ in range(KEPT_UPLOADS + 4):
+        viewer.lighting.take_picture("evening.png", content.getvalue())
+    folder = Path(viewer.lighting._uploads.name)
+    assert len(list(folder.iterdir())) == KEPT_UPLOADS
+    chosen = Path(viewer.lighting.desk.first.spec)
+    with Image.open(chosen) as kept:
+        assert max(kept.size) == UPLOAD_SIDE
+    assert viewer.lighting.desk.first.label == "evening.png"
+
+
+def test_a_picture_of_many_pixels_is_refused_unread(viewer: Viewer, huge_picture: bytes) -> None:
+    tracemalloc.start()
+    with pytest.raises(UserError, match="exceed the limit") as caught:
+        viewer.lighting.take_picture("huge.png", huge_picture)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    assert "--max-image-pixels" not in str(caught.value), "the viewer has no such option"
 
 
 def test_a_fault_in_the_viewer_does_not_end_its_worker(
@@ -194,4 +240,27 @@ def test_gaussians_that_came_meanwhile_are_shown(trainer_for, wall: Scene) -> No
     viewer.lighting.set_amount(0.4)
     work_off(viewer)
     assert len(colors(viewer)) == len(trainer.method.gaussians) == len(wall.points) + 7
+    viewer.close()
+
+
+def test_a_name_that_is_not_utf8_breaks_nothing(learnt: Trainer, wall: Scene) -> None:
+    """Names are bytes; the page is sent as UTF-8."""
+    names = ["caf\udce9.jpg", "line\nbreak.jpg", *(view.name for view in wall.views[2:])]
+    views = tuple(replace(view, name=name) for view, name in zip(wall.views, names, strict=True))
+    viewer = open_on(Subject(learnt.method, replace(wall, views=views)))
+    work_off(viewer)
+    viewer.photos.visit(None, views[0])
+    viewer.complain(f"{names[0]}: no")
+    work_off(viewer)
+    assert viewer.photos._choice.value == "caf\\xe9.jpg"
+    buffer = viewer.server._websock_server.get_message_buffer()
+    sent = [
+        msgspec.msgpack.encode(message.as_serializable_dict([]))
+        for message in buffer.message_from_id.values()
+    ]
+    assert any(b"caf\\xe9.jpg" in message for message in sent)
+    viewer.lighting.choose(Light(names[0], names[0]))
+    work_off(viewer)
+    assert viewer._lit_by is not None
+    assert viewer._lit_by.first.spec == names[0], "the name itself is still what finds the photo"
     viewer.close()

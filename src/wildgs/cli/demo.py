@@ -1,13 +1,12 @@
-"""`wildgs demo`: the built-in landmark, from nothing to a page to look at."""
+"""`wildgs demo`: the built-in landmark, from its photos to a page to look at."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from demo_generator import SyntheticConfig, make_landmark
 from wildgs.cli.eval import evaluate_run, print_scores
-from wildgs.cli.progress import console, counting
+from wildgs.cli.progress import console
 from wildgs.cli.showcase import Scores, write_showcase
 from wildgs.cli.training import read_scene, train_or_go_on
 from wildgs.cli.webpage import write_scene_page
@@ -19,12 +18,13 @@ from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import MethodName
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import load_run
+from wildgs.scene.demo import write_demo_scene
 
 TITLES: dict[MethodName, str] = {"wildgs": "Wild-GS", "3dgs": "3DGS"}
 SUMMARY = (
-    "A landmark made in code and photographed by {photos} imagined visitors: other hours, other cameras, people in "
-    "the way. Wild-GS and plain 3D Gaussian Splatting were trained on their photos for the same number of steps; "
-    "both are scored on photos that neither has seen, against the same views without passers-by."
+    "A made-up landmark in {photos} rendered photos: different hours and cameras, and people in the way. Wild-GS "
+    "and plain 3D Gaussian Splatting were trained on them for {steps:,} steps each. Both are scored on held-out "
+    "photos, against the same views without the people."
 )
 
 
@@ -34,7 +34,7 @@ MAX_GAUSSIANS = 30_000
 
 @dataclass(frozen=True)
 class Command:
-    """Makes a small landmark, trains Wild-GS and plain 3DGS on its photos, scores both, writes a page.
+    """Trains Wild-GS and plain 3DGS on the 40 photos of the built-in landmark, scores both and writes a page.
 
     Example: wildgs demo --output wildgs-demo
     """
@@ -43,27 +43,16 @@ class Command:
     """Folder for the scene, both runs, report.html and scene.html."""
     steps: int = 1500
     """Training steps of each method."""
-    photos: int = 40
-    """How many visitors take a photo."""
-    long_side: int = 240
-    """Longer side of the photos, pixels."""
 
 
 def run(command: Command) -> None:
-    """Makes, trains, scores, writes the page."""
-    if command.photos < 8 or command.long_side < 32 or command.steps < 1:
-        raise UserError("the demo needs at least 8 photos of 32 pixels and 1 step")
+    """Unpacks the scene, trains and scores both methods, and writes the pages."""
+    if command.steps < 1:
+        raise UserError(f"steps {command.steps}: must be 1 or more")
     page = command.output / "report.html"
     if page.exists():
         raise UserError(f"{page} exists already; open it, or choose another --output")
-    folder = command.output / "scene"
-    if not (folder / "split.tsv").is_file():
-        with counting("photographing the landmark") as progress:
-            make_landmark(
-                folder,
-                SyntheticConfig(photos=command.photos, long_side=command.long_side),
-                progress=progress,
-            )
+    folder = write_demo_scene(command.output / "scene")
     runs = []
     for method in ("wildgs", "3dgs"):
         config = RunConfig(folder.resolve(), method, model=MODEL, train=_training(command.steps))
@@ -77,13 +66,14 @@ def run(command: Command) -> None:
         }
         runs.append((TITLES[method], loaded, scores))
     print_scores({name: scores for name, _, scores in runs})
-    write_showcase(page, "Wild-GS demo", SUMMARY.format(photos=command.photos), scene, runs)
+    summary = SUMMARY.format(photos=len(scene.views), steps=command.steps)
+    write_showcase(page, "Wild-GS demo", summary, scene, runs)
     scene_page = command.output / "scene.html"
     write_scene_page(runs[0][1], scene_page, "Wild-GS demo")
     console.print(f"open {page.resolve()} in a browser: scores and comparisons")
-    console.print(f"open {scene_page.resolve()} in a browser: the scene, to fly through in any light")
+    console.print(f"open {scene_page.resolve()} in a browser: the scene itself, under several lights")
 
 
 def _training(steps: int) -> TrainConfig:
-    """The defaults, with no more Gaussians than photos this small can tell apart."""
+    """The defaults, with as many Gaussians as photos of this size can resolve."""
     return TrainConfig(steps=steps, density=DensityConfig(max_gaussians=MAX_GAUSSIANS))

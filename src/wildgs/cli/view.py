@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -12,12 +13,16 @@ from wildgs.api import load
 from wildgs.cli.progress import console
 from wildgs.engine.trainer import StepReport, Trainer
 from wildgs.errors import UserError
+from wildgs.files import printable
 from wildgs.scene import Scene
 from wildgs.viewer.jobs import start_worker
-from wildgs.viewer.server import ServerConfig, address, open_server
+from wildgs.viewer.server import ServerConfig, address, open_server, public_address
 from wildgs.viewer.subject import Subject, TrainingSubject
 from wildgs.viewer.training import TrainingTurns
 from wildgs.viewer.viewer import Viewer, ViewerConfig
+
+if TYPE_CHECKING:
+    from wildgs.viewer.guarded import GuardedServer
 
 VIDEO_FOLDER = "videos"
 
@@ -40,7 +45,8 @@ class Command:
 def run(command: Command) -> None:
     """Serves the page until interrupted."""
     viewer = open_viewer(command)
-    console.print(f"{command.run}: {address(viewer.server, command.server)}  (Ctrl-C ends it)")
+    print_address(viewer.server, command.server, f"{command.run}")
+    console.print("Ctrl-C ends the viewer")
     stay(viewer)
 
 
@@ -61,6 +67,13 @@ def open_viewer(command: Command) -> Viewer:
     except BaseException:
         server.stop()
         raise
+
+
+def print_address(server: GuardedServer, config: ServerConfig, name: str) -> None:
+    """Prints where the page is; each address on one line, because its token must be copied whole."""
+    for url in (address(server, config), public_address(server, config)):
+        if url is not None:
+            console.print(f"{printable(name)}: {url}", markup=False, soft_wrap=True)
 
 
 def stay(viewer: Viewer) -> None:
@@ -99,5 +112,5 @@ def watch_training(
     def watched() -> bool:
         return bool(server.get_clients())
 
-    console.print(f"viewer: {address(server, server_config)}")
+    print_address(server, server_config, "viewer")
     return viewer, TrainingTurns(viewer.jobs, watched, update)

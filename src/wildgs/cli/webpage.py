@@ -13,9 +13,8 @@ from wildgs.api import LoadedScene
 from wildgs.cli.lights import find_look
 from wildgs.cli.showcase import different_lights
 from wildgs.export.cleanup import CleanupConfig, kept_rows
-from wildgs.export.page import Page, PageLight, PageView, write_page
+from wildgs.export.page import Page, PageLight, PageView, choose_start, write_page
 from wildgs.export.splats import Splats
-from wildgs.export.start_view import choose_start
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.model.gaussians import NEAR
 from wildgs.runs import Run

@@ -18,8 +18,7 @@ from torch import Tensor
 from wildgs.errors import UserError
 from wildgs.evaluation.lpips import LPIPS, MIN_SIDE
 from wildgs.evaluation.lpips_weights import load_lpips
-from wildgs.evaluation.masks import MaskScore
-from wildgs.evaluation.metrics import psnr, structural_similarity, to_8bit
+from wildgs.evaluation.metrics import MaskScore, psnr, structural_similarity, to_8bit
 from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
 from wildgs.model.method import Method
 from wildgs.scene.scene import Scene, View

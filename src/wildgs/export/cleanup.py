@@ -11,8 +11,7 @@ from torch import Tensor
 from wildgs.export.config import CleanupConfig
 from wildgs.export.splats import Splats
 from wildgs.geometry.camera import Camera
-from wildgs.geometry.sh_cut import cut_sh, fit_cut
-from wildgs.geometry.spherical_harmonics import num_sh_bases
+from wildgs.geometry.spherical_harmonics import fit_truncation, num_sh_bases, truncate_sh
 from wildgs.model.gaussians import NEAR
 from wildgs.model.triplane import robust_box
 from wildgs.rasterize import rasterize
@@ -57,8 +56,10 @@ def clean(
     kept = splats.select(kept_rows(config, splats, points)) if config.active else splats
     if config.sh_degree is None or num_sh_bases(config.sh_degree) >= kept.sh.shape[1]:
         return kept
-    fit = fit_cut(kept.means, viewpoints, kept.sh_degree, config.sh_degree) if len(viewpoints) else None
-    return kept.with_sh(cut_sh(kept.sh, config.sh_degree, fit))
+    fit = (
+        fit_truncation(kept.means, viewpoints, kept.sh_degree, config.sh_degree) if len(viewpoints) else None
+    )
+    return kept.with_sh(truncate_sh(kept.sh, config.sh_degree, fit))
 
 
 def agreement(first: Splats, second: Splats, cameras: Sequence[Camera]) -> float:

@@ -8,14 +8,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from wildgs.errors import UserError
-from wildgs.export.ply import ply_bytes, write_bytes
 from wildgs.export.splats import Splats
+from wildgs.files import written_aside
 
 SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog"]
 """By their endings: 3DGS's own, PlayCanvas's compressed one, antimatter15's, Niantic's, and PlayCanvas's SOG."""
+
+_LEAST_OPACITY = 1e-6
+"""Opacities closer to 0 or 1 have no finite logit in single precision."""
 
 _SPZ_HALF_RANGE = 2**23
 """Coordinates in .spz are fixed-point numbers of 24 bits with a sign."""
@@ -40,7 +44,41 @@ def write_splats(file: Path, splats: Splats, kind: SplatFormat) -> None:
         content = _by_gsply(splats, kind)
     else:
         content = ply_bytes(splats) if kind == "ply" else _by_gaussforge(splats, kind)
-    write_bytes(file, content)
+    with written_aside(file) as aside:
+        aside.write_bytes(content)
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """The file's content.
+
+    Per Gaussian, as 32-bit floats: x y z, an unused normal, f_dc (degree 0, r g b), f_rest (the other harmonics,
+    all of red, then green, then blue), opacity (logit), scale (logarithm), rot (unit quaternion w x y z).
+    """
+    count = len(splats)
+    rest = splats.sh[:, 1:].transpose(1, 2).reshape(count, -1)
+    columns = {
+        "xyz": splats.means,
+        "normals": torch.zeros(count, 3),
+        "f_dc": splats.sh[:, 0],
+        "f_rest": rest,
+        "opacity": splats.opacities.clamp(_LEAST_OPACITY, 1 - _LEAST_OPACITY).logit()[:, None],
+        "scale": splats.scales.clamp_min(1e-12).log(),
+        "rot": torch.nn.functional.normalize(splats.quats, dim=1),
+    }
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    for prefix in ("f_dc", "f_rest"):
+        names += [f"{prefix}_{index}" for index in range(columns[prefix].shape[1])]
+    names += ["opacity", *(f"scale_{axis}" for axis in range(3)), *(f"rot_{part}" for part in range(4))]
+    table = torch.cat([column.float() for column in columns.values()], dim=1).numpy().astype("<f4")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment Wild-GS",
+        f"element vertex {count}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
+    return ("\n".join(header) + "\n").encode("ascii") + np.ascontiguousarray(table).tobytes()
 
 
 def _by_gaussforge(splats: Splats, kind: SplatFormat) -> bytes:

@@ -23,10 +23,13 @@ from wildgs.export.page_scene import PackedScene, pack_scene
 from wildgs.export.splats import Splats
 from wildgs.files import written_aside
 from wildgs.geometry.camera import Camera
-from wildgs.geometry.sh_cut import cut_sh, fit_cut
+from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
 
 BUDGET_BYTES = 25_000_000
 """Size below which the page stays by giving up degrees of the spherical harmonics."""
+
+_MIDDLE = 0.3
+"""Half size of the central part of a picture, whose points tell the distance of the landmark."""
 
 THUMBNAIL = (288, 192)
 _QUALITY = 82
@@ -117,8 +120,8 @@ def write_page(
 def _pack(page: Page, degree: int, viewpoints: Float[Tensor, "V 3"] | None) -> PackedScene:
     fit = None
     if degree < page.splats.sh_degree and viewpoints is not None and len(viewpoints):
-        fit = fit_cut(page.splats.means, viewpoints, page.splats.sh_degree, degree)
-    return pack_scene(page.splats, [cut_sh(light.sh, degree, fit).numpy() for light in page.lights])
+        fit = fit_truncation(page.splats.means, viewpoints, page.splats.sh_degree, degree)
+    return pack_scene(page.splats, [truncate_sh(light.sh, degree, fit).numpy() for light in page.lights])
 
 
 def _compose(page: Page, scene: PackedScene) -> str:
@@ -168,3 +171,46 @@ def _thumbnail(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
     buffer = io.BytesIO()
     image.crop((left, top, left + wide, top + tall)).save(buffer, "JPEG", quality=_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tuple[int, float]:
+    """The camera that shows most of the scene, as large as it fits, and the distance of what it looks at.
+
+    Args:
+        cameras: Of the training photos, at least one.
+        points: SfM points in the same frame.
+
+    Returns:
+        Index of the camera, and the depth of the landmark before it in world units.
+    """
+    scores = torch.tensor([_score(camera, points) for camera in cameras])
+    best = int(scores.argmax())
+    return best, _depth(cameras[best], points)
+
+
+def _project(camera: Camera, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
+    """Places in the picture (0 to 1 on each axis) and depths of the points before the camera."""
+    pixels, depths = camera.project(points)
+    before = depths > 1e-3
+    return pixels[before] / torch.tensor([camera.width, camera.height]).to(points), depths[before]
+
+
+def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
+    """Share of the points that the picture shows, times the share of the picture over which most of them spread.
+
+    The first falls when the camera stands too near, the second when it stands too far.
+    """
+    places, _ = _project(camera, points)
+    inside = places[((places >= 0) & (places <= 1)).all(dim=1)]
+    if len(inside) < 2:
+        return 0.0
+    spread = inside.quantile(0.95, dim=0) - inside.quantile(0.05, dim=0)
+    return len(inside) / len(points) * float(spread.prod().sqrt())
+
+
+def _depth(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
+    """Median depth of the points in the picture's middle."""
+    places, depths = _project(camera, points)
+    middle = ((places - 0.5).abs() < _MIDDLE).all(dim=1)
+    chosen = depths[middle] if bool(middle.any()) else depths
+    return float(chosen.median()) if len(chosen) else 1.0

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.rotation import rotations_to_quats
-from wildgs.geometry.sh_rotation import rotate_sh, sh_degree
+from wildgs.geometry.spherical_harmonics import rotate_sh, sh_degree
 from wildgs.scene.scene import Alignment
 
 

@@ -1,7 +1,7 @@
 """Triton kernels that sample three planes at points and scatter gradients back, channels last.
 
-grid_sample's gradient adds 384 numbers a point (3 planes, 4 corners, 32 channels) into channel-first planes, each to
-an address of its own; here the channels of a cell are one line of memory, read and added to together.
+grid_sample's gradient adds 384 numbers a point (3 planes, 4 corners, 32 channels) into channel-first planes, each
+to an address of its own; here the channels of a cell are one line of memory, read and added to together.
 """
 
 from __future__ import annotations

@@ -11,11 +11,21 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped, UInt8, UInt16
-from PIL import Image, ImageOps
+from PIL import Image
 
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 
 EXIF_ORIENTATION = 0x0112
+TRANSPOSITIONS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What makes a picture upright, by its EXIF orientation."""
 ASPECT_TOLERANCE = 0.01
 """Sizes have the same shape when their aspects differ by less than this share (or a pixel's rounding)."""
 
@@ -93,7 +103,8 @@ def _load(image: Image.Image) -> None:
 def upright_size(image: Image.Image) -> tuple[int, int]:
     """Width and height once the EXIF orientation is applied, from the header alone."""
     width, height = image.size
-    return (height, width) if _orientation(image) in (5, 6, 7, 8) else (width, height)
+    turned = _orientation(image) in (5, 6, 7, 8) and image.format != "TIFF"  # Pillow turns those itself
+    return (height, width) if turned else (width, height)
 
 
 def _orientation(image: Image.Image) -> int:
@@ -101,6 +112,15 @@ def _orientation(image: Image.Image) -> int:
         return int(image.getexif().get(EXIF_ORIENTATION, 1))
     except Exception:  # a broken EXIF block does not make the pixels worse
         return 1
+
+
+def _upright(image: Image.Image) -> Image.Image:
+    """The loaded picture with its EXIF orientation applied.
+
+    `ImageOps.exif_transpose` also writes the EXIF block anew, which fails on blocks with odd entries.
+    """
+    method = TRANSPOSITIONS.get(_orientation(image))
+    return image if method is None else image.transpose(method)
 
 
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
@@ -141,8 +161,7 @@ def read_photo(
                     f"{_times(image.size)} pixels, but its camera is {_times(camera_size)}"
                 )
         _load(image)
-        upright = ImageOps.exif_transpose(image) if turn else image
-        colours, alpha = _to_rgb(upright)
+        colours, alpha = _to_rgb(_upright(image) if turn else image)
         return Photo(
             pixels=np.array(_resize(colours, size, Image.Resampling.LANCZOS)),
             opaque=None if alpha is None else _resize_mask(alpha, size),

@@ -12,10 +12,10 @@ class ServerConfig:
     """Where the viewer is reached.
 
     Attributes:
-        host: Address to listen on. The default lets this machine in and no other; 0.0.0.0 lets everyone in who can
-            reach this machine, who then sees the photos and can use its processor.
+        host: Address to listen on: 127.0.0.1 for local access only, 0.0.0.0 for all interfaces. Whoever has the
+            address with its token sees the photos and can use this machine's processor.
         port: Port to listen on; the next free one where it is taken.
-        share: Also make a public address through viser's own relay: everyone who has it can look.
+        share: Also open a public address through viser's relay.
     """
 
     host: str = LOCAL
@@ -25,10 +25,10 @@ class ServerConfig:
 
 @dataclass(frozen=True)
 class ViewerConfig:
-    """What is shown.
+    """Contents of the viewer's page.
 
     Attributes:
-        photos: How many photos are offered as thumbnails and frustums; more are reached by name.
+        photos: Number of photos shown as thumbnails and frustums; all others can be chosen by name.
     """
 
     photos: int = 48

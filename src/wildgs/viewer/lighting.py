@@ -1,7 +1,8 @@
-"""The light: two photos (or pictures), and a slider between them."""
+"""The light: two photos or uploaded pictures, and a slider that interpolates between them."""
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from collections.abc import Callable
@@ -10,9 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from wildgs.errors import UserError
+from wildgs.files import printable, written_aside
 from wildgs.light.look import Look, mix
+from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.viewer.gallery import Gallery
 from wildgs.viewer.markup import (
     Thumbnail,
@@ -27,7 +31,14 @@ from wildgs.viewer.subject import Subject
 if TYPE_CHECKING:
     import viser
 
-MAX_UPLOAD_BYTES = 64 * 2**20
+    from wildgs.viewer.guarded import GuardedServer
+
+MAX_UPLOAD_PIXELS = 50_000_000
+"""Of an uploaded picture; a file of a few hundred kB can hold hundreds of megapixels."""
+UPLOAD_SIDE = 2048
+"""Uploaded pictures are kept no larger: they are encoded much smaller."""
+KEPT_UPLOADS = 16
+"""Files of uploaded pictures that are kept; older ones are deleted."""
 SIDES = ("Left", "Right")
 """Ends of the slider: a click on a photo gives its light to the chosen one."""
 
@@ -86,26 +97,24 @@ class LightPanel:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: GuardedServer,
         desk: LightDesk,
         gallery: Gallery,
         changed: Callable[[], None],
-        complain: Callable[[str], None],
         lender: Callable[[], str],
     ) -> None:
         """Adds the controls to the container that is open.
 
         Args:
             server: The viewer's.
-            desk: How it begins.
+            desk: The lights to begin with.
             gallery: Photos to choose from.
             changed: Called, on a thread of viser's, after the desk changed.
-            complain: Called with one line for a picture that cannot be used.
             lender: Names the photo whose camera a picture borrows.
         """
         self.desk = desk
         self._server, self._gallery = server, gallery
-        self._changed, self._complain, self._lender = changed, complain, lender
+        self._changed, self._lender = changed, lender
         self._uploads = tempfile.TemporaryDirectory(prefix="wildgs-view-")
         self._number = 0
         self.touched = False
@@ -121,15 +130,13 @@ class LightPanel:
         self._upload = gui.add_upload_button("A picture of your own", mime_type="image/*")
         gui.add_html(drop_zone(element_id(self._upload)))
         self._slider.on_update(lambda _: self.set_amount(self._slider.value))
-        self._upload.on_upload(
-            lambda _: self.take_picture(self._upload.value.name, self._upload.value.content)
-        )
+        server.uploads.receive(element_id(self._upload), self.take_picture)
         gallery.on_change(self._draw_thumbnails)
         self._draw_thumbnails()
         self._refresh()
 
     def _add_button(self, name: str) -> viser.GuiButtonHandle:
-        button = self._server.gui.add_button(name)
+        button = self._server.gui.add_button(printable(name))
         button.on_click(lambda _: self.choose(Light(name, name)))
         return button
 
@@ -145,21 +152,24 @@ class LightPanel:
 
     def set_amount(self, amount: float) -> None:
         """Moves along the slider."""
-        if amount != self.desk.amount:
+        if math.isfinite(amount) and amount != self.desk.amount:
             self.touched = True
-            self._set(replace(self.desk, amount=float(amount)))
+            self._set(replace(self.desk, amount=min(max(float(amount), 0.0), 1.0)))
 
     def take_picture(self, name: str, content: bytes) -> None:
-        """Lights the scene like a picture that a browser sent."""
-        if len(content) > MAX_UPLOAD_BYTES:
-            self._complain(f"{name}: pictures may have up to {MAX_UPLOAD_BYTES // 2**20} MB")
-            return
+        """Lights the scene like a picture that a browser sent.
+
+        Raises:
+            UserError: It cannot be used.
+        """
         self._number += 1
-        try:
-            file = store_upload(Path(self._uploads.name), self._number, name, content)
-        except UserError as error:
-            self._complain(str(error))
-            return
+        folder = Path(self._uploads.name)
+        file = store_upload(folder, self._number, name, content)
+        used = {self.desk.first.spec, self.desk.second.spec}
+        kept = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-KEPT_UPLOADS]
+        for old in kept:
+            if str(old) not in used:
+                old.unlink(missing_ok=True)
         self.choose(Light(str(file), name, self._lender()))
 
     def _set(self, desk: LightDesk) -> None:
@@ -198,17 +208,32 @@ class LightPanel:
 
 
 def store_upload(folder: Path, number: int, name: str, content: bytes) -> Path:
-    """Writes what a browser sent under a name of ours: of its own only letters and digits are kept.
+    """Decodes a picture that a browser sent, and writes it small, under a plain name.
+
+    Args:
+        folder: Where it goes.
+        number: Makes its name unique.
+        name: The browser's name for it, of which letters and digits are kept.
+        content: The file.
 
     Raises:
-        UserError: It is empty.
+        UserError: It cannot be read, or has too many pixels.
     """
-    if not content:
-        raise UserError(f"{name}: the picture is empty")
     stem = re.sub(r"[^A-Za-z0-9]+", "-", Path(name.replace("\\", "/")).stem).strip("-")[:40]
-    file = folder / f"{stem or 'picture'}-{number}.img"
-    file.write_bytes(content)
-    return file
+    received = folder / f"received-{number}"
+    try:
+        received.write_bytes(content)
+        picture = Image.fromarray(read_photo(received, max_pixels=MAX_UPLOAD_PIXELS).pixels)
+    except UnreadableImageError as error:
+        raise UserError(str(error).replace(" (--max-image-pixels)", "")) from error
+    except OSError as error:
+        raise UserError(f"it cannot be stored ({error.strerror}); free disk space") from error
+    finally:
+        received.unlink(missing_ok=True)
+    picture.thumbnail((UPLOAD_SIDE, UPLOAD_SIDE), Image.Resampling.LANCZOS, reducing_gap=2.0)
+    with written_aside(folder / f"{stem or 'picture'}-{number}.png") as aside:
+        picture.save(aside, format="PNG", compress_level=1)
+    return folder / f"{stem or 'picture'}-{number}.png"
 
 
 def most_different(colors: dict[str, np.ndarray], start: str) -> str:

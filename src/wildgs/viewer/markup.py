@@ -14,6 +14,8 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from wildgs.files import printable
+
 THUMBNAIL_SIDE = 96
 CHOSEN_COLORS = ("#4dabf7", "#ffa94d")
 """Frames of the first and the second light's thumbnail."""
@@ -35,8 +37,8 @@ class Thumbnail:
 
 
 def escape(text: str) -> str:
-    """Text as it is, in HTML."""
-    return html.escape(text, quote=True)
+    """Text as it is, in HTML; what does not print, as escapes: the page is sent as UTF-8."""
+    return html.escape(printable(text), quote=True)
 
 
 def element_id(handle: Any) -> str:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from wildgs.files import printable
 from wildgs.scene import View
 from wildgs.viewer.cameras import fov_that_holds, pose_of
 from wildgs.viewer.comparison import Comparison
@@ -42,7 +43,7 @@ class PhotoPanel:
             visited: Called, on a thread of viser's, when someone stands at a photo's viewpoint.
         """
         self._server, self._gallery, self._visited = server, gallery, visited
-        self._by_name = {view.name: view for view in views}
+        self._by_label = {printable(view.name): view for view in views}
         self.current: View | None = None
         self._frustums: dict[str, viser.CameraFrustumHandle] = {}
         gui = server.gui
@@ -52,7 +53,7 @@ class PhotoPanel:
             "Show cameras", False, hint="Where photos were taken; a click on one goes there"
         )
         shown.on_update(lambda _: setattr(self.parent, "visible", shown.value))
-        self._choice = gui.add_dropdown("Go to photo", (NO_PHOTO, *self._by_name), initial_value=NO_PHOTO)
+        self._choice = gui.add_dropdown("Go to photo", (NO_PHOTO, *self._by_label), initial_value=NO_PHOTO)
         self._choice.on_update(self._chosen)
         self.own_light = gui.add_checkbox(
             "Under its own light",
@@ -94,8 +95,8 @@ class PhotoPanel:
         if client is not None:
             stand_at(client, view)
         self.current = view
-        if self._choice.value != view.name:
-            self._choice.value = view.name
+        if self._choice.value != printable(view.name):
+            self._choice.value = printable(view.name)
         self._visited(view)
 
     def show(self, comparison: Comparison) -> None:
@@ -108,7 +109,7 @@ class PhotoPanel:
         self._pictures.content = figures(pictures, note)
 
     def _chosen(self, event: viser.GuiEvent) -> None:
-        view = self._by_name.get(self._choice.value)
+        view = self._by_label.get(self._choice.value)
         if view is not None and (self.current is None or view.name != self.current.name):
             self.visit(event.client, view)
 

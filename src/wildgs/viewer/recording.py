@@ -1,4 +1,4 @@
-"""A path through the scene: views are added one by one, the way between them is smooth, a video is made of it."""
+"""A camera path: keyframes are added one by one, interpolated smoothly, and rendered as a video."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ if TYPE_CHECKING:
 PARENT = "/path"
 HEIGHTS = ("360", "480", "720", "1080")
 ASPECT = 16 / 9
-LEAST_VIEWS = 2
+MIN_VIEWS, MAX_VIEWS = 2, 200
+SECONDS = (1.0, 60.0)
+"""Shortest and longest video; with the largest of `HEIGHTS` this bounds its frames and their size."""
 COLOR = (77, 171, 247)
 MARKER_SIZE = 0.04
 
 
 @dataclass(frozen=True)
 class VideoOrder:
-    """What a video shall be.
+    """Settings of a video.
 
     Attributes:
-        keyframes: Views on the way, at least two.
+        keyframes: Cameras to interpolate, at least two.
         seconds: Its length.
-        relight: Whether the light goes from the left one to the right one on the way.
+        relight: Whether the light changes from the left to the right one along the path.
     """
 
     keyframes: tuple[Camera, ...]
@@ -41,7 +43,7 @@ class VideoOrder:
 
 
 class RecordingPanel:
-    """The controls of a path, and its views as frustums in the scene.
+    """The controls of a camera path, and its keyframes as frustums in the scene.
 
     Attributes:
         folder: Where videos go.
@@ -57,7 +59,7 @@ class RecordingPanel:
 
         Args:
             server: The viewer's.
-            folder: Where videos go; None while there can be none (training).
+            folder: Where videos go; None while none can be made (training).
             ordered: Called, on a thread of viser's, with the browser that wants the video.
         """
         self.folder = folder
@@ -69,11 +71,11 @@ class RecordingPanel:
             "Add this view", hint="The camera where it is now becomes the next view of the path"
         )
         add.on_click(lambda event: None if event.client is None else self.add(event.client.camera))
-        gui.add_button("Take the last one away").on_click(lambda _: self.drop())
-        self._seconds = gui.add_slider("Seconds", 1.0, 60.0, 0.5, 6.0)
+        gui.add_button("Remove the last view").on_click(lambda _: self.drop())
+        self._seconds = gui.add_slider("Seconds", *SECONDS, 0.5, 6.0)
         self._height = gui.add_dropdown("Height", HEIGHTS, initial_value="480")
         self._relight = gui.add_checkbox(
-            "Light goes from left to right", False, hint="Otherwise it stays as it is shown"
+            "Change light from left to right", False, hint="Otherwise the light stays as it is shown"
         )
         self._make = gui.add_button("Make the video", disabled=folder is None)
         self._make.on_click(lambda event: self._ordered(event.client))
@@ -81,7 +83,10 @@ class RecordingPanel:
         self.tell(self._describe())
 
     def add(self, camera: ViserCamera) -> None:
-        """The next view of the path."""
+        """Adds a keyframe; a path that is full stays as it is."""
+        if len(self._poses) >= MAX_VIEWS:
+            self.tell(f"A path has at most {MAX_VIEWS} views.")
+            return
         pose = Pose(np.array(camera.wxyz), np.array(camera.position), float(camera.fov), ASPECT)
         self._poses.append(pose)
         marker = self._server.scene.add_camera_frustum(
@@ -98,23 +103,30 @@ class RecordingPanel:
         self.tell(self._describe())
 
     def drop(self) -> None:
-        """Forgets the last view."""
+        """Removes the last keyframe."""
         if self._poses:
             self._poses.pop()
             self._markers.pop().remove()
         self.tell(self._describe())
 
     def order(self) -> VideoOrder:
-        """What was asked for.
+        """The video as the controls describe it.
 
         Raises:
-            UserError: A path needs more views.
+            UserError: The path has too few views, or the video would be too long or too large.
         """
-        if len(self._poses) < LEAST_VIEWS:
-            raise UserError("a path needs two views or more: fly somewhere, add the view, and again")
+        if len(self._poses) < MIN_VIEWS:
+            raise UserError(
+                "a path needs at least two views: add this view, fly somewhere else, and add that one"
+            )
+        seconds = float(self._seconds.value)
+        if self._height.value not in HEIGHTS or not SECONDS[0] <= seconds <= SECONDS[1]:
+            raise UserError(
+                f"videos take up to {SECONDS[1]:.0f} seconds and are up to {HEIGHTS[-1]} pixels high"
+            )
         height = int(self._height.value)
         cameras = tuple(camera_of(pose, height) for pose in self._poses)
-        return VideoOrder(cameras, float(self._seconds.value), bool(self._relight.value))
+        return VideoOrder(cameras, seconds, bool(self._relight.value))
 
     def tell(self, text: str) -> None:
         """Shows a line below the controls."""
@@ -124,8 +136,8 @@ class RecordingPanel:
 
     def _describe(self) -> str:
         if self.folder is None:
-            return "Videos can be made once training is done: open the run with wildgs view."
+            return "Videos can be made after training: open the run with wildgs view."
         count = len(self._poses)
-        if count < LEAST_VIEWS:
+        if count < MIN_VIEWS:
             return f"{count} of at least two views. Fly somewhere and add the view."
         return f"{count} views"

@@ -1,4 +1,4 @@
-"""The viser server: where it listens, who may reach it, and how its page looks before there is anything on it."""
+"""The viewer's server: where it listens, its addresses, and the empty page."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ import importlib
 import io
 import socket
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from wildgs.errors import UserError
+from wildgs.files import printable
 from wildgs.viewer.config import LOCAL, ServerConfig
 
 if TYPE_CHECKING:
-    import viser
+    from wildgs.viewer.guarded import GuardedServer
 
 REMEDY = "the viewer needs viser: pip install 'wildgs[viewer]'"
 
 
-def open_server(config: ServerConfig, title: str) -> viser.ViserServer:
+def open_server(config: ServerConfig, title: str) -> GuardedServer:
     """Starts an empty viewer page.
 
     Args:
@@ -27,38 +29,46 @@ def open_server(config: ServerConfig, title: str) -> viser.ViserServer:
         title: Stands above the controls.
 
     Raises:
-        UserError: viser is not installed, the address is none of this machine's, or sharing failed.
+        UserError: viser is not installed, the address is not one of this machine's, or sharing failed.
     """
-    viser = import_viser()
+    import_viser()
+    from wildgs.viewer.guarded import GuardedServer
+
     _check_address(config)
-
-    class Server(viser.ViserServer):
-        """A server that no browser can tell to open a public address: viser itself lets every one of them."""
-
-        def request_share_url(self, verbose: bool = True) -> str | None:
-            return super().request_share_url(verbose) if config.share else None
-
     with contextlib.redirect_stdout(io.StringIO()):  # viser greets in a box of its own
-        server = Server(host=config.host, port=config.port, verbose=False)
-    if config.share and server.request_share_url(verbose=False) is None:
-        server.stop()
-        raise UserError("viser's relay gave no public address; leave --share out and look from this machine")
-    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=config.share)
-    server.gui.set_panel_label(title)
+        server = GuardedServer(config.host, config.port, share=config.share)
+    if config.share:
+        public = server.request_share_url(verbose=False)
+        if public is None:
+            server.stop()
+            raise UserError(
+                "viser's relay gave no public address; leave --share out and use the local address"
+            )
+        server.access.allow_name(urlsplit(public).hostname or "")
+    # viser's own share dialog would show the public address without the token.
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    server.gui.set_panel_label(printable(title))
     server.scene.set_up_direction("+z")
     # What no Gaussian covers is black, as the rasteriser has it.
     server.scene.set_background_image(np.zeros((2, 2, 3), dtype=np.uint8), format="png")
     return server
 
 
-def address(server: viser.ViserServer, config: ServerConfig) -> str:
-    """What to type into a browser on this machine."""
+def address(server: GuardedServer, config: ServerConfig) -> str:
+    """What to type into a browser on this machine: the address with the viewer's token."""
     host = LOCAL if config.host in ("0.0.0.0", "::", "") else config.host
-    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
+    local = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
+    return f"{local}/{server.access.token}/"
+
+
+def public_address(server: GuardedServer, config: ServerConfig) -> str | None:
+    """The address at viser's relay, None unless the viewer is shared."""
+    public = server.request_share_url(verbose=False) if config.share else None
+    return None if public is None else f"{public.rstrip('/')}/{server.access.token}/"
 
 
 def import_viser():
-    """The library, which is an extra.
+    """Imports viser, which is an optional dependency.
 
     Raises:
         UserError: It is not installed; the message says how to get it.
@@ -72,14 +82,15 @@ def import_viser():
 
 
 def _check_address(config: ServerConfig) -> None:
-    """Refuses what viser would try on one port after the other, for ever."""
+    """Refuses addresses that viser would try on a thousand ports, one after the other."""
     if not 0 <= config.port <= 65535:
-        raise UserError(f"--port {config.port}: ports are 0 to 65535, and 0 takes any free one")
+        raise UserError(f"--port {config.port}: ports are 0 to 65535, 0 for any free one")
     try:
         family, kind, protocol, _, target = socket.getaddrinfo(config.host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as trial:
             trial.bind(target)
     except OSError as error:
         raise UserError(
-            f"--host {config.host}: this machine has no such address; {LOCAL} lets this machine in, 0.0.0.0 all"
+            f"--host {config.host}: this machine has no such address; use {LOCAL} for local access only,"
+            " 0.0.0.0 for all interfaces"
         ) from error

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from wildgs.errors import UserError
+from wildgs.files import printable
 from wildgs.geometry.lens import focus
 from wildgs.model.gaussians import NEAR
 from wildgs.scene import Scene, View
@@ -35,6 +36,8 @@ from wildgs.viewer.subject import Subject
 if TYPE_CHECKING:
     import viser
 
+    from wildgs.viewer.guarded import GuardedServer
+
 REPAINT_SECONDS = 0.4
 """While the camera moves, colours follow no more often: each time, all splats are sent anew."""
 REPAINT_DISTANCE = 0.01
@@ -48,7 +51,7 @@ class Viewer:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: GuardedServer,
         subject: Subject,
         config: ViewerConfig,
         lights: Sequence[str] = (),
@@ -93,7 +96,6 @@ class Viewer:
                 self._first_desk(lights),
                 self.gallery,
                 self._light_changed,
-                self.complain,
                 self._nearest_photo,
             )
             self.lighting.touched = bool(lights)
@@ -126,7 +128,7 @@ class Viewer:
         client.camera.on_update(self._camera_moved)
 
     def _camera_moved(self, camera: ViserCamera) -> None:
-        eye = torch.from_numpy(np.asarray(camera.position)).float()
+        eye = torch.from_numpy(np.asarray(camera.position, dtype=np.float64)).float()
         if (eye - self.display.eye).norm() < REPAINT_DISTANCE:
             return
         self.display.eye = eye
@@ -167,7 +169,7 @@ class Viewer:
     def complain(self, message: str) -> None:
         """Shows a line in every browser: something could not be done."""
         for client in self.server.get_clients().values():
-            client.add_notification("That did not work", message, color="red", auto_close_seconds=15)
+            client.add_notification("Failed", printable(message), color="red", auto_close_seconds=15)
 
     def _ask(self, kind: str, job: Job) -> None:
         self.jobs.put(kind, lambda: self._try(job))
