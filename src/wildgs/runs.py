@@ -13,7 +13,8 @@ import filelock
 import torch
 
 from wildgs.config import RunConfig, read_config, to_plain, write_config
-from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
+from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest
+from wildgs.engine.checkpoint_writer import CheckpointWriter
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
@@ -259,7 +260,25 @@ def resume_training(
     return trainer
 
 
-def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Alignment) -> Path:
-    """Writes a checkpoint from which training can go on and every other verb can read."""
+def save_run(
+    folder: Path,
+    trainer: Trainer,
+    config: RunConfig,
+    alignment: Alignment,
+    writer: CheckpointWriter | None = None,
+) -> None:
+    """Writes a checkpoint from which training can go on and every other verb can read.
+
+    Args:
+        folder: The run folder.
+        trainer: Whose state is saved.
+        config: Of the run.
+        alignment: Of its scene.
+        writer: Writes it, perhaps later; None writes it now.
+
+    Raises:
+        UserError: It cannot be written.
+    """
     header: dict[str, Any] = {"config": to_plain(config), "alignment": alignment.to_dict()}
-    return save_checkpoint(folder / CHECKPOINT_FOLDER, trainer.step, trainer.state(), header)
+    writer = writer or CheckpointWriter(background=False)
+    writer.save(folder / CHECKPOINT_FOLDER, trainer.step, trainer.state(), header)

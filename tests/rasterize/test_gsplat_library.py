@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -151,3 +153,51 @@ def test_no_gaussian_needs_no_kernel(monkeypatch: pytest.MonkeyPatch):
     assert rendering.colors[3, 4].tolist() == [0, 1, 0]
     assert sh_to_colors(none, torch.zeros(0, 1, 3), CAMERA, degree=0).shape == (0, 3)
     load_gsplat.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("nvcc", "wanted", "words"),
+    [
+        (None, "13.0", "nvcc is not installed; torch was built with CUDA 13.0"),
+        ("12.4", "13.0", "is of CUDA 12.4, and torch was built with CUDA 13.0"),
+        ("13.1", "13.0", None),
+        ("13.0", None, "this build of torch has no CUDA"),
+    ],
+)
+def test_the_compiler_is_compared_with_torch(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, nvcc: str | None, wanted: str | None, words: str | None
+):
+    found = None
+    if nvcc is not None:
+        compiler = tmp_path / "bin" / "nvcc"
+        compiler.parent.mkdir()
+        compiler.write_text(f"#!/bin/sh\necho 'Cuda compilation tools, release {nvcc}, V{nvcc}.99'\n")
+        compiler.chmod(0o755)
+        monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+        found = gsplat_library.find_nvcc()
+        assert found == (compiler, nvcc)
+    monkeypatch.setattr(gsplat_library, "find_nvcc", lambda: found)
+    monkeypatch.setattr(torch.version, "cuda", wanted)
+    problem = gsplat_library.toolkit_problem()
+    assert problem is None if words is None else words in (problem or "")
+
+
+def test_a_build_is_found_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    assert not gsplat_library.is_built()
+    (tmp_path / "gsplat_cuda").mkdir()
+    (tmp_path / "gsplat_cuda" / "gsplat_cuda.so").write_bytes(b"")
+    assert gsplat_library.is_built()
+
+
+def test_an_interrupted_build_is_not_deleted(tmp_path: Path):
+    build, other = tmp_path / "gsplat_cuda", tmp_path / "other"
+    for folder in (build, other):
+        folder.mkdir()
+    with gsplat_library._interrupted_builds_continue():
+        shutil.rmtree(build)
+        shutil.rmtree(other)
+    assert build.is_dir()
+    assert not other.exists()
+    shutil.rmtree(build)
+    assert not build.exists()

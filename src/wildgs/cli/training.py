@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from wildgs import features
 from wildgs.cli.interrupts import InterruptedTrainingError, StopOnSignal
 from wildgs.cli.logs import logger, run_log
 from wildgs.cli.progress import TrainingProgress, console, counting
 from wildgs.config import RunConfig, read_config
 from wildgs.engine.autosave import Autosave, AutosaveConfig
+from wildgs.engine.checkpoint_writer import CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
     from wildgs.viewer.viewer import Viewer
 
 RETRY_SHARE = 0.8
+LEAST_SECONDS_ON_CUDA = 60.0
+"""Between two checkpoints; there a thousand steps take some ten seconds."""
 """Of the Gaussians with which memory ran out, for the second try."""
 
 
@@ -215,8 +219,13 @@ def train_to_end(
         _follow(trainer)
         return
     label = f"training {config.method}" + (f" on {team.size} processes" if team.size > 1 else "")
+    on_cuda = trainer.device.type == "cuda"
+    writer = CheckpointWriter(background=on_cuda and features.is_on("checkpoint_thread"))
     saver = Autosave(
-        lambda: save_run(folder, trainer, config, scene.alignment), autosave or AutosaveConfig(), trainer.step
+        lambda: save_run(folder, trainer, config, scene.alignment, writer),
+        autosave or AutosaveConfig(),
+        trainer.step,
+        least_seconds=LEAST_SECONDS_ON_CUDA if on_cuda else 0.0,
     )
     with (
         run_log(folder),
@@ -228,16 +237,22 @@ def train_to_end(
         try:
             trainer.run([recorder, progress, saver, stop, *observers])
         except InterruptedTrainingError as interrupt:
-            team.from_first(lambda: saver.save(trainer.step))
+            team.from_first(lambda: _save_last(saver, writer, trainer.step))
             interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
             raise
-        saver.save(trainer.step)
+        _save_last(saver, writer, trainer.step)
         logger.info("done: %d steps in %.0f s", trainer.step, trainer.seconds)
     minutes = trainer.seconds / 60
     console.print(
         f"{label}: {trainer.step} steps in {minutes:.1f} min on {_device_name(trainer.device)}, "
         f"{len(trainer.method.gaussians):,} Gaussians -> {folder}"
     )
+
+
+def _save_last(saver: Autosave, writer: CheckpointWriter, step: int) -> None:
+    """Saves the last step and waits until it is on the disk."""
+    saver.save(step)
+    writer.wait()
 
 
 def _follow(trainer: Trainer) -> None:

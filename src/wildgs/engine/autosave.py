@@ -35,25 +35,31 @@ class Autosave:
     what made them fail may be in the parameters already.
     """
 
-    def __init__(self, save: Callable[[], object], config: AutosaveConfig, step: int) -> None:
+    def __init__(
+        self, save: Callable[[], object], config: AutosaveConfig, step: int, *, least_seconds: float = 0.0
+    ) -> None:
         """Sets up an `Autosave`.
 
         Args:
             save: Writes a checkpoint of the trainer's present state; raises `UserError` where it cannot.
             config: When.
             step: The step of the newest checkpoint.
+            least_seconds: Time between two checkpoints, however many steps it is.
         """
         self._save = save
         self.config = config
         self.saved_step = step
         self._due = self._next_time()
+        self._least_seconds = least_seconds
+        self._saved_at = float("-inf")
 
     def _next_time(self) -> float:
         return time.monotonic() + 60 * self.config.checkpoint_minutes
 
     def __call__(self, report: StepReport) -> None:
         """Saves if it is time to; where that fails, warns and tries again a minute later."""
-        on_step = report.falls_on(self.config.checkpoint_every)
+        rested = time.monotonic() - self._saved_at >= self._least_seconds
+        on_step = rested and report.falls_on(self.config.checkpoint_every)
         if report.skipped is not None or not (on_step or time.monotonic() >= self._due):
             return
         try:
@@ -71,4 +77,5 @@ class Autosave:
         if step > self.saved_step:
             self._save()
             self.saved_step = step
+            self._saved_at = time.monotonic()
             self._due = self._next_time()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import importlib.util
 import inspect
 import os
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -113,12 +116,29 @@ def require_extension() -> None:
         UserError: There is no nvcc, or the build failed.
     """
     try:
-        extension = importlib.import_module("gsplat.cuda._backend")._C
+        with _interrupted_builds_continue():
+            extension = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # torch's build raises many kinds of errors
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise UserError(f"gsplat's CUDA extension could not be built ({reason}): {build_help()}") from error
     if extension is None:
         raise UserError(f"gsplat has no CUDA extension here, because it found no nvcc: {build_help()}")
+
+
+@contextmanager
+def _interrupted_builds_continue() -> Iterator[None]:
+    """Keeps what an interrupted build has compiled, which gsplat would delete before it builds."""
+    remove = shutil.rmtree
+
+    def keep(path: Any, *arguments: Any, **keywords: Any) -> None:
+        if Path(path).name != "gsplat_cuda":
+            remove(path, *arguments, **keywords)
+
+    shutil.rmtree = keep
+    try:
+        yield
+    finally:
+        shutil.rmtree = remove
 
 
 def build_help() -> str:
@@ -130,6 +150,30 @@ def build_help() -> str:
         "GPU's architecture, MAX_JOBS limits parallel compilers); `wildgs doctor --build-gsplat` builds it ahead; "
         "CUDA_VISIBLE_DEVICES= runs on the CPU instead"
     )
+
+
+def is_built() -> bool:
+    """Whether gsplat's CUDA extension was installed with it, or built before by the installed torch."""
+    if importlib.util.find_spec("gsplat.csrc") is not None:
+        return True
+    from torch.utils.cpp_extension import get_default_build_root
+
+    root = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root())
+    names = ("gsplat_cuda/gsplat_cuda.*", "*/gsplat_cuda/gsplat_cuda.*")
+    built = [path for name in names for path in root.glob(name)]
+    return any(path.suffix in (".so", ".pyd") for path in built)
+
+
+def toolkit_problem() -> str | None:
+    """Why gsplat's CUDA extension cannot be built here; None where the compiler fits torch."""
+    wanted, found = torch.version.cuda, find_nvcc()
+    if wanted is None:
+        return "this build of torch has no CUDA"
+    if found is None:
+        return f"nvcc is not installed; torch was built with CUDA {wanted}"
+    if found[1].split(".")[0] != wanted.split(".")[0]:
+        return f"{found[0]} is of CUDA {found[1]}, and torch was built with CUDA {wanted}"
+    return None
 
 
 def find_nvcc() -> tuple[Path, str] | None:
