@@ -70,6 +70,7 @@ fi
 run() {
   local name=$1 limit=$2 kept=$3 left began code
   shift 3
+  [ -z "$dry" ] || limit=600
   left=$((budget - SECONDS - kept))
   [ "$limit" -le "$left" ] || limit=$left
   began=$SECONDS
@@ -120,7 +121,7 @@ CODE
 for stage in "${stages[@]}"; do
   case $stage in
     install)
-      if [ -n "$dry" ]; then run install 200 0 "$python" -c 'import torch'; continue; fi
+      if [ -n "$dry" ]; then run install 20 "$reserve" "$python" -c 'import torch'; continue; fi
       export -f install
       export python wheels
       run install 30 "$reserve" bash -c install

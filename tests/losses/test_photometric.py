@@ -209,8 +209,16 @@ def test_convolutions_never_run_in_tf32(monkeypatch: pytest.MonkeyPatch):
     y = x + 0.004 * torch.rand(24, 32, 3, generator=generator)
     leaves = [x.requires_grad_(), y.requires_grad_()]
     wanted, found = ssim(*leaves), _ConvolutionSSIM.apply(*leaves)
-    assert float(found) == pytest.approx(float(wanted), abs=1e-3)
+    assert float(found.detach()) == pytest.approx(float(wanted.detach()), abs=1e-3)
     gradients = [torch.autograd.grad(value, leaves) for value in (found, wanted)]
     for one, other in zip(*gradients, strict=True):
         assert float((one - other).norm() / other.norm()) < 0.01
     assert torch.backends.cudnn.allow_tf32
+
+
+def test_convolutions_stay_on_their_device():
+    pictures = [torch.empty(9, 12, 3, device="meta", requires_grad=True) for _ in range(2)]
+    value = ssim(*pictures)
+    value.backward()
+    assert value.device.type == "meta"
+    assert [picture.grad.device.type for picture in pictures if picture.grad is not None] == ["meta", "meta"]
