@@ -7,11 +7,11 @@ What a stage did not leave is null or empty; its exit code says why.
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 import json
 import platform
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -126,7 +126,11 @@ def gather(output: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    output = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("output", type=Path, help="the folder that gpu.sh wrote")
+    output: Path = parser.parse_args().output
     report = gather(output)
     (output / "gpu.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     print(json.dumps({"gpu.json": str(output / "gpu.json"), "device": report["device"]}))

@@ -83,7 +83,7 @@ def test_distance_is_symmetric_and_zero_for_equal_pictures(network, tmp_path):
 def test_smallest_picture_works_and_smaller_ones_are_refused(network):
     model = LPIPS(network)
     assert model(picture(0, MIN_SIDE, MIN_SIDE), picture(1, MIN_SIDE, MIN_SIDE)).isfinite()
-    with pytest.raises(ValueError, match="pixels a side"):
+    with pytest.raises(ValueError, match="pixels per side"):
         model(picture(0, MIN_SIDE - 1, 40), picture(1, MIN_SIDE - 1, 40))
 
 
@@ -164,4 +164,4 @@ def test_weights_of_another_network_are_refused(tmp_path):
     save_random_weights("alex", tmp_path, "squeezenet1_1_features.pth", "linear.pth", prefix="")
     model, note = load_lpips(tmp_path)
     assert model is None
-    assert "cannot be used" in note
+    assert "cannot load" in note

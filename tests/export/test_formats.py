@@ -88,7 +88,7 @@ def test_gaussforge_reads_the_spz_in_the_formats_own_axes(splats: Splats, tmp_pa
     assert places.shape == (len(splats), 3)
     flip = torch.tensor([1.0, -1.0, -1.0])
     _close(places, splats.means * flip, 1e-4)
-    turned = splats.turned(torch.diag(flip))
+    turned = splats.rotated(torch.diag(flip))
     _same_turn(np.frombuffer(read["rotations"], "<f4").reshape(-1, 4), turned.quats)
     _close(np.frombuffer(read["sh"], "<f4").reshape(-1, 15, 3), turned.sh[:, 1:], 0.13)
 

@@ -97,12 +97,12 @@ def test_every_picture_is_inside_the_page_with_its_own_pixels_and_says_what_it_s
     by_color = {str(a["alt"]): np.asarray(image)[-1, -1].tolist() for a, image in pictures}
     for alt, color in {
         "Photo a.jpg": (200, 30, 30),
-        "Render of a.jpg under its own light": (30, 200, 30),
+        "Render of a.jpg under its own appearance": (30, 200, 30),
         "Visibility mask of a.jpg": (255, 255, 255),
-        "a.jpg without its passers-by": (250, 250, 250),
+        "a.jpg without transients": (250, 250, 250),
         "a.jpg rendered by 3DGS": (10, 10, 10),
-        "a.jpg rendered under the light of b.jpg": (120, 120, 9),
-        "Photo b.jpg, whose light it is": (9, 9, 200),
+        "a.jpg rendered under the appearance of b.jpg": (120, 120, 9),
+        "Photo b.jpg, the source of the appearance": (9, 9, 200),
     }.items():
         np.testing.assert_allclose(by_color[alt], color, atol=4)
     assert len(pictures) == 8
@@ -169,7 +169,7 @@ def test_a_report_without_scores_views_or_other_lights_is_still_a_page(tmp_path:
     assert "A summary" in _write(tmp_path).text
     page = _write(tmp_path, _example(height=32, width=24))
     assert len(page.pictures()) == 4
-    assert not any("light of other photos" in text for text in page.text)
+    assert not any("appearance of other photos" in text for text in page.text)
 
 
 def test_a_second_report_replaces_the_first(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Scores of many runs -> one row per scene, protocol and method: means and spreads over seeds. Reads no file."""
+"""Aggregates scores of many runs: one row per scene, protocol and method, with mean and deviation over seeds."""
 
 from __future__ import annotations
 

@@ -12,18 +12,18 @@ from torch import Tensor, nn
 
 Network = Literal["alex", "squeeze"]
 MIN_SIDE = 32
-"""Smallest side in pixels for which both backbones' deepest layer has an extent."""
+"""Smallest side in pixels for which the deepest layer of both backbones is not empty."""
 
-# LPIPS's own normalisation of inputs in -1..1.
+# Normalisation of inputs in [-1, 1], from LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
 
 class LPIPS(nn.Module):
-    """The learned perceptual distance of two pictures.
+    """Learned perceptual distance of two pictures.
 
-    Weights come from `wildgs.evaluation.lpips_weights`. Layers are compared after their ReLU, each with its
-    channels normalised to unit length, squared, weighted by the linear layer and averaged over the picture.
+    Features after each tapped ReLU are normalised to unit length over the channels; squared differences are
+    weighted by the linear layer and averaged over the picture. `wildgs.evaluation.lpips_weights` loads the weights.
     """
 
     shift: Tensor
@@ -39,14 +39,14 @@ class LPIPS(nn.Module):
         self.requires_grad_(False).eval()
 
     def load(self, backbone: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
-        """Take weights in torchvision's and LPIPS's own layouts.
+        """Loads weights in the layouts of torchvision and LPIPS.
 
         Args:
-            backbone: torchvision's state dict, of the whole network or of its `features` alone.
-            linear: LPIPS's ``lin{i}.model.1.weight``, each [1, C, 1, 1].
+            backbone: State dict of torchvision, of the whole network or of its `features`.
+            linear: ``lin{i}.model.1.weight`` of LPIPS, each [1, C, 1, 1].
 
         Raises:
-            RuntimeError: Names or shapes do not fit.
+            RuntimeError: Names or shapes do not match.
         """
         prefix = "features."
         if any(name.startswith(prefix) for name in backbone):
@@ -55,18 +55,18 @@ class LPIPS(nn.Module):
         for i, weight in enumerate(self.linear):
             given = linear.get(f"lin{i}.model.1.weight")
             if given is None or given.numel() != weight.numel():
-                raise RuntimeError(f"linear layer {i} is missing or not of {weight.numel()} channels")
+                raise RuntimeError(f"linear layer {i} is missing or does not have {weight.numel()} channels")
             weight.copy_(given.flatten())
 
     @torch.no_grad()
     def forward(self, first: UInt8[Tensor, "H W 3"], second: UInt8[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """The distance: 0 for equal pictures, about 0.7 for unlike ones.
+        """Distance of two pictures: 0 if they are equal, about 0.7 if they are unrelated.
 
         Raises:
             ValueError: A side is shorter than `MIN_SIDE` pixels.
         """
         if min(first.shape[:2]) < MIN_SIDE:
-            raise ValueError(f"LPIPS needs at least {MIN_SIDE} pixels a side")
+            raise ValueError(f"LPIPS needs at least {MIN_SIDE} pixels per side")
         pair = torch.stack([first, second]).permute(0, 3, 1, 2).to(self.scale) / 127.5 - 1
         x = (pair - self.shift) / self.scale
         distance = x.new_zeros(())
@@ -80,7 +80,7 @@ class LPIPS(nn.Module):
 
 
 class _Fire(nn.Module):
-    """SqueezeNet's module; names as torchvision's, so that its weights load."""
+    """Fire module of SqueezeNet, with the parameter names of torchvision."""
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ class _Fire(nn.Module):
 
 
 def _alexnet() -> tuple[nn.Sequential, tuple[int, ...], tuple[int, ...]]:
-    """Layers at torchvision's positions, positions that are compared, and their widths."""
+    """Layers as in torchvision, indices of the tapped layers, and their widths."""
     features = nn.Sequential(
         nn.Conv2d(3, 64, 11, stride=4, padding=2),
         nn.ReLU(),
@@ -113,7 +113,7 @@ def _alexnet() -> tuple[nn.Sequential, tuple[int, ...], tuple[int, ...]]:
 
 
 def _squeezenet() -> tuple[nn.Sequential, tuple[int, ...], tuple[int, ...]]:
-    """Layers at torchvision's positions, positions that are compared, and their widths."""
+    """Layers as in torchvision, indices of the tapped layers, and their widths."""
     features = nn.Sequential(
         nn.Conv2d(3, 64, 3, stride=2),
         nn.ReLU(),

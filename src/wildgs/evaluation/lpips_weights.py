@@ -1,4 +1,4 @@
-"""Where LPIPS's weights are: a folder, torch's hub cache, an installed package, the official download."""
+"""Finds LPIPS weights: a folder, the cache of torch.hub, an installed package, or the official download."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import torch
 from wildgs.evaluation.lpips import LPIPS, Network
 
 ENVIRONMENT = "WILDGS_LPIPS"
-"""A folder with a backbone and its linear layers, or ``off`` for no LPIPS at all."""
+"""Environment variable: a folder with a backbone and its linear layers, or ``off`` to disable LPIPS."""
 
 OFFICIAL = {"alex": "alexnet-owt-7be5be79.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
 _BACKBONE_URL = "https://download.pytorch.org/models/"
@@ -29,12 +29,12 @@ _TIMEOUT_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class LpipsFiles:
-    """Weights at hand.
+    """Files of the weights.
 
     Attributes:
-        network: Which backbone.
-        backbone: Its file, torchvision's layout.
-        linear: LPIPS's linear layers.
+        network: Backbone.
+        backbone: Weights of the backbone, in the layout of torchvision.
+        linear: Linear layers of LPIPS.
     """
 
     network: Network
@@ -43,11 +43,11 @@ class LpipsFiles:
 
 
 def find_lpips(folder: Path | None = None) -> LpipsFiles | None:
-    """Weights on this machine, AlexNet's before SqueezeNet's; downloads nothing.
+    """Finds weights on this machine, AlexNet before SqueezeNet, without downloading.
 
     Args:
-        folder: Looked at alone where given; else the folder that `WILDGS_LPIPS` names; else torch's hub
-            cache, with linear layers beside the backbone or in an installed `lpips` or `torchmetrics`.
+        folder: The only folder to search. By default the folder in `WILDGS_LPIPS`, otherwise the cache of
+            torch.hub, with linear layers beside the backbone or in an installed `lpips` or `torchmetrics`.
     """
     chosen = folder or _folder_from_environment()
     if chosen is not None:
@@ -57,11 +57,14 @@ def find_lpips(folder: Path | None = None) -> LpipsFiles | None:
 
 
 def load_lpips(folder: Path | None = None, download: bool = True) -> tuple[LPIPS | None, str]:
-    """The network, and a line for the notes that says which one it is, or why there is none.
+    """Loads LPIPS, or states why it is not available.
 
     Args:
         folder: As for `find_lpips`.
-        download: Whether to try the official AlexNet weights (240 MB, tried once) where none are at hand.
+        download: Download the official AlexNet weights (240 MB) if none are found; tried once.
+
+    Returns:
+        The network or None, and a line for the notes of `metrics.json`.
     """
     setting = os.environ.get(ENVIRONMENT, "").strip()
     if folder is None and setting.lower() == "off":
@@ -70,28 +73,23 @@ def load_lpips(folder: Path | None = None, download: bool = True) -> tuple[LPIPS
     files = find_lpips(folder)
     if files is None and explicit is not None:
         return None, (
-            f"LPIPS is null: {explicit} holds no backbone (alexnet*.pth or squeezenet1_1*.pth) "
+            f"LPIPS is null: {explicit} contains no backbone (alexnet*.pth or squeezenet1_1*.pth) "
             "with linear layers (linear.pth, alex.pth or squeeze.pth)"
         )
     if files is None and download:
         files = _download()
     if files is None:
-        return None, f"LPIPS is null: its weights are not at hand; {how_to_get_lpips()}"
+        return None, f"LPIPS is null: weights not found; get them with `{how_to_get_lpips()}`"
     try:
         model = LPIPS(files.network)
         model.load(_read(files.backbone), _read(files.linear))
-    except (
-        Exception
-    ) as error:  # unpickling raises errors of many kinds; scores without LPIPS beat none at all
-        return (
-            None,
-            f"LPIPS is null: {files.backbone} or {files.linear} cannot be used ({_first_line(error)})",
-        )
+    except Exception as error:  # unpickling raises many kinds; other scores must not be lost
+        return None, f"LPIPS is null: cannot load {files.backbone} or {files.linear} ({_first_line(error)})"
     return model, f"LPIPS v0.1 with {'AlexNet' if files.network == 'alex' else 'SqueezeNet 1.1'}"
 
 
 def how_to_get_lpips() -> str:
-    """What to type so that LPIPS is there next time."""
+    """Shell command that downloads the official weights."""
     checkpoints = _hub_folder()
     name = OFFICIAL["alex"]
     return (
@@ -122,7 +120,7 @@ def _find_in(backbones: list[Path], linears: list[Path]) -> LpipsFiles | None:
 
 
 def _package_folders() -> list[Path]:
-    """Folders of installed packages that ship LPIPS's linear layers; the packages are not imported."""
+    """Folders of installed packages that contain the linear layers of LPIPS; the packages are not imported."""
     places = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
     folders = []
     for package, place in places.items():
@@ -134,8 +132,8 @@ def _package_folders() -> list[Path]:
 
 @cache
 def _download() -> LpipsFiles | None:
-    """The official AlexNet weights into torch's hub cache; None where they cannot be reached. Tried once."""
-    # The small file first, and aside: looking up a name has no timeout of its own.
+    """Downloads the official AlexNet weights into the cache of torch.hub; None if that fails. Tried once."""
+    # The small file first, in a thread: name resolution has no timeout.
     small = threading.Thread(target=_fetch, args=(_LINEAR_URL + "alex.pth", "lpips_alex.pth"), daemon=True)
     small.start()
     small.join(_TIMEOUT_SECONDS)
@@ -146,14 +144,14 @@ def _download() -> LpipsFiles | None:
 
 
 def _fetch(url: str, name: str) -> None:
-    """Downloads a file into the hub cache; leaves nothing there where that fails."""
+    """Downloads a file into the hub cache; a failure leaves no file."""
     hashed = name == OFFICIAL["alex"]
     try:
         with _socket_timeout(_TIMEOUT_SECONDS):
             torch.hub.load_state_dict_from_url(
                 url, map_location="cpu", progress=hashed, check_hash=hashed, file_name=name, weights_only=True
             )
-    except Exception:  # urllib, ssl, socket, unpickling and hash errors alike mean that there are no weights
+    except Exception:  # urllib, ssl, socket, unpickling or hash errors: there are no weights
         return
 
 

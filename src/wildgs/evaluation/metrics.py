@@ -10,11 +10,11 @@ from wildgs.losses.ssim import ssim_map
 
 _BINS = 1 << 16
 MAX_PSNR = 100.0
-"""What equal pictures score, in dB, so that means stay finite."""
+"""PSNR of equal pictures in dB, so that means stay finite."""
 
 
 def to_8bit(picture: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
-    """Clamp to 0..1 and round to 8 bits, as a picture file holds it; what is not a number becomes black."""
+    """Clamps to [0, 1] and rounds to 8 bits, as in an image file; NaN becomes black."""
     return (picture.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -23,15 +23,15 @@ def psnr(
     truth: UInt8[Tensor, "H W 3"],
     keep: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB, from the mean square error over all pixels and channels.
+    """Peak signal-to-noise ratio from the mean squared error over all pixels and channels.
 
     Args:
-        render: What is scored.
-        truth: What it should be.
+        render: Picture to score.
+        truth: Ground truth.
         keep: Pixels that count; None for all.
 
     Returns:
-        Decibels, at most `MAX_PSNR`.
+        PSNR in dB, at most `MAX_PSNR`.
     """
     square = ((render.double() - truth.double()) / 255).square()
     error = (square if keep is None else square[keep]).mean()
@@ -43,15 +43,14 @@ def structural_similarity(
     truth: UInt8[Tensor, "H W 3"],
     keep: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """SSIM as 3DGS and its descendants report it: Gaussian window of 11, sigma 1.5, data range 1.
+    """SSIM as 3DGS reports it: Gaussian window of 11, sigma 1.5, data range 1, double precision.
 
-    Windows at the border reach into zeros (3DGS's choice; others drop the border's 5 pixels instead), moments
-    are not corrected for the sample's size, and the map is averaged over pixels and channels. In double
-    precision.
+    Borders are padded with zeros as in 3DGS (other implementations crop 5 pixels instead), and moments are biased.
+    The map is averaged over pixels and channels.
 
     Args:
-        render: What is scored.
-        truth: What it should be.
+        render: Picture to score.
+        truth: Ground truth.
         keep: Pixels whose windows count; None for all.
     """
     similarity = ssim_map(render.double() / 255, truth.double() / 255)
@@ -59,10 +58,10 @@ def structural_similarity(
 
 
 class MaskScore:
-    """Pools pixels of many photos; memory does not grow with them.
+    """Scores predicted transient masks against the ground truth, pooled over the pixels of many photos.
 
-    A transient pixel is a positive, and ``1 - M`` is its score. Scores are sorted into 65,536 bins; smaller
-    differences are ties.
+    Transient pixels are positives with score ``1 - M``. Scores are counted in 65,536 bins, so that memory does not
+    grow with the number of photos.
     """
 
     def __init__(self, threshold: float = 0.5) -> None:
@@ -74,11 +73,11 @@ class MaskScore:
         self._either = 0
 
     def add(self, visibility: Float[Tensor, "H W"], static: Bool[Tensor, "H W"]) -> None:
-        """Count one photo.
+        """Adds one photo.
 
         Args:
-            visibility: M, 1 = static.
-            static: The truth.
+            visibility: Predicted mask M, 1 = static.
+            static: Ground truth.
         """
         transient_score = (1 - visibility.detach().cpu().double()).clamp(0, 1)
         bins = (transient_score * (_BINS - 1)).round().long().flatten()
@@ -92,7 +91,7 @@ class MaskScore:
 
     @property
     def average_precision(self) -> float | None:
-        """Σ (R_n - R_{n-1}) P_n over all thresholds (scikit-learn's definition); None without transients."""
+        """Σ (R_n - R_{n-1}) P_n over all thresholds (as in scikit-learn); None without transients."""
         negatives, positives = self._counts.flip(1).cumsum(1)
         total = positives[-1]
         if total == 0:
@@ -103,9 +102,9 @@ class MaskScore:
 
     @property
     def iou(self) -> float | None:
-        """Intersection over union of predicted and true transients; None where neither has any."""
+        """Intersection over union of predicted and true transients; None if there are none."""
         return self._both / self._either if self._either else None
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """What `metrics.json` holds under ``masks``."""
+        """Content of ``masks`` in `metrics.json`."""
         return {"average_precision": self.average_precision, "iou": self.iou, "images": self.images}

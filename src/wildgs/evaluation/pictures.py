@@ -1,4 +1,4 @@
-"""Files of an evaluation: pictures by view, each written aside and renamed."""
+"""Output files: one picture per view, and JSON, written atomically."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from wildgs.files import written_aside
 
 
 def picture_paths(names: Iterable[str]) -> dict[str, PurePosixPath]:
-    """Where each view's picture goes, relative to the evaluation's folder.
+    """Relative path of the picture of each view.
 
-    Folders in a name are kept. A part that would leave the folder (``..``, a root, a drive) is replaced, and
-    views that differ by their suffix alone keep it, so that no two views share a file.
+    Folders in a name are kept, parts that leave the output folder (``..``, a root, a drive) are replaced, and the
+    suffix is kept for views that differ in nothing else, so that no two views share a file.
 
     Args:
         names: Unique view names.
@@ -46,12 +46,12 @@ def _inside(name: str) -> PurePosixPath:
 
 
 def write_picture(file: Path, picture: UInt8[Tensor, "H W 3"]) -> None:
-    """Write a PNG; a run cut short leaves no half picture under its name."""
+    """Writes a PNG atomically."""
     with written_aside(file) as aside:
         Image.fromarray(picture.cpu().numpy()).save(aside, format="PNG")
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:
-    """Write strict JSON (no NaN), aside first and renamed."""
+    """Writes strict JSON (without NaN) atomically."""
     with written_aside(file) as aside:
         aside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

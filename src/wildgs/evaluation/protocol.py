@@ -1,4 +1,4 @@
-"""The two protocols of evaluation, never mixed: appearance from the whole photo, or from its left half."""
+"""The two evaluation protocols: appearance from the whole test photo, or from its left half."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TIMED_FRAMES = 15
 
 @dataclass(frozen=True)
 class ImageScore:
-    """One view's scores; None where a metric could not be computed."""
+    """Scores of one view; None if a metric could not be computed."""
 
     name: str
     psnr: float | None
@@ -40,7 +40,7 @@ class ImageScore:
 
 @dataclass
 class _Notes:
-    """Lines for the reader of `metrics.json`, each once."""
+    """Distinct notes for `metrics.json`."""
 
     lines: list[str] = field(default_factory=list)
 
@@ -61,38 +61,37 @@ def evaluate(
     mask_threshold: float = 0.5,
     on_view: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Render and score the held-out views; write ``eval/<protocol>/<stem>.png`` and ``metrics.json``.
+    """Renders and scores the held-out views; writes ``eval/<protocol>/<stem>.png`` and ``metrics.json``.
 
-    `full` reads a view's appearance from the whole test photo and scores the whole frame. `half` reads it
-    from the left half alone (columns below ``W // 2``, with the camera cropped to them: mask, embedding and
-    lifting see nothing else) and scores the other columns as a picture of their own; the file holds the whole
-    frame.
+    `full` takes the appearance of a view from the whole test photo and scores the whole image. `half` takes it
+    from the left half (columns below ``W // 2``, with a cropped camera: mask, embedding and lifting see nothing
+    else) and scores the right half as an image of its own. The written picture is the whole image in both.
 
-    A view is scored against its clean truth where there is one, else against the photo. In the latter case
-    pixels that the view's mask ignores count neither in PSNR nor in SSIM, and are made equal to the photo's
-    before LPIPS. Renders are rounded to 8 bits first.
+    A view is scored against its clean truth if there is one, otherwise against the photo. In the latter case,
+    pixels that the mask of the view ignores are excluded from PSNR and SSIM, and replaced by the photo for LPIPS.
+    Renders are rounded to 8 bits first.
 
-    In `full`, predicted masks of training photos are scored too, where the scene holds true masks.
+    In `full`, predicted masks of training photos are scored too, if the scene has ground truth masks.
 
     Args:
         method: A trained method.
-        scene: With at least one test view.
-        protocol: Which of the two.
-        run: The run folder.
-        step: Training steps that `method` has seen, for the record.
-        train_seconds: How long they took, for the record.
-        lpips_folder: LPIPS's weights; None looks where `find_lpips` says.
-        mask_threshold: Th, for the intersection over union of masks.
-        on_view: Told each view's name when it is done.
+        scene: Scene with at least one test view.
+        protocol: `full` or `half`.
+        run: Run folder.
+        step: Training steps of `method`, for the record.
+        train_seconds: Training time, for the record.
+        lpips_folder: Folder of LPIPS weights; by default as in `find_lpips`.
+        mask_threshold: Threshold Th for the intersection over union of masks.
+        on_view: Called with the name of each finished view.
 
     Returns:
-        What `metrics.json` holds.
+        Content of `metrics.json`.
 
     Raises:
-        UserError: The scene holds out no photo.
+        UserError: The scene has no test views.
     """
     if not scene.test_views:
-        raise UserError(f"{scene.root} holds out no photo to score: mark some as 'test' in its split .tsv")
+        raise UserError(f"{scene.root} has no test photos to score: mark some as 'test' in its split .tsv")
     folder = run / "eval" / protocol
     lpips, line = load_lpips(lpips_folder)
     notes = _Notes([line])
@@ -130,7 +129,7 @@ def evaluate(
 
 @contextmanager
 def _inference(method: Method) -> Iterator[None]:
-    # Not inference_mode: what a method caches meanwhile must stay usable for training.
+    # Not inference_mode: tensors that a method caches must stay usable in training.
     training = method.training
     method.eval()
     try:
@@ -141,7 +140,7 @@ def _inference(method: Method) -> Iterator[None]:
 
 
 def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
-    """Harmonics under the view's own light, as far as the protocol shows it."""
+    """Spherical harmonics under the appearance of the view, from the part of the photo that the protocol shows."""
     photo, camera, keep = _read_photo(view, device), view.camera.to(device), _read_keep(view, device)
     if protocol == "half":
         half = photo.shape[1] // 2
@@ -153,7 +152,7 @@ def _shade(method: Method, view: View, protocol: Protocol, device: torch.device)
 def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Notes) -> UInt8[Tensor, "H W 3"]:
     colors = method.render(view.camera.to(sh.device), sh).colors
     if not colors.isfinite().all():
-        notes.add(f"{view.name}: the render holds values that are no numbers, scored as black")
+        notes.add(f"{view.name}: the render contains non-finite values, scored as black")
     return to_8bit(colors)
 
 
@@ -168,17 +167,17 @@ def _score_view(
     truth = (view.read_photo() if clean is None else clean).to(render.device)
     keep = _read_keep(view, render.device) if clean is None else None
     if clean is not None:
-        notes.add("views with a clean truth are scored against it, not against the photo")
+        notes.add("views with a clean truth are scored against it instead of the photo")
     if protocol == "half":
         half = render.shape[1] // 2
         render, truth = render[:, half:], truth[:, half:]
         keep = None if keep is None else keep[:, half:]
     if keep is not None:
         notes.add(
-            "pixels that a photo's mask ignores are left out of PSNR and SSIM, and equal the photo's in LPIPS"
+            "pixels that a mask ignores are excluded from PSNR and SSIM, and replaced by the photo for LPIPS"
         )
         if not keep.any():
-            notes.add(f"{view.name}: its mask ignores all that would be scored")
+            notes.add(f"{view.name}: the mask ignores all pixels that would be scored")
             return ImageScore(view.name, None, None, None)
     return ImageScore(
         name=view.name,
@@ -204,7 +203,7 @@ def _perceptual(
     if lpips is None:
         return None
     if min(render.shape[:2]) < MIN_SIDE:
-        notes.add(f"{view.name}: LPIPS is null, the scored part has less than {MIN_SIDE} pixels a side")
+        notes.add(f"{view.name}: LPIPS is null, the scored part has fewer than {MIN_SIDE} pixels per side")
         return None
     if keep is not None:
         render = torch.where(keep[..., None], render, truth)
@@ -214,7 +213,7 @@ def _perceptual(
 def _measure_fps(
     method: Method, sh: Float[Tensor, "N K 3"], views: tuple[View, ...], device: torch.device
 ) -> float:
-    """Frames per second of plain rendering under cached harmonics: the median frame of the views' cameras."""
+    """Frames per second under cached harmonics: the median over the cameras of the views."""
     cameras = [view.camera.to(device) for view in views[:_TIMED_FRAMES]]
     method.render(cameras[0], sh)
     seconds = []
@@ -233,7 +232,7 @@ def _synchronize(device: torch.device) -> None:
 
 
 def _score_masks(method: Method, scene: Scene, device: torch.device, threshold: float) -> MaskScore | None:
-    """Scores of training photos' masks; None where there is no truth or the method predicts no mask."""
+    """Scores of the masks of training photos; None without ground truth or predicted masks."""
     score = MaskScore(threshold)
     for view in scene.train_views:
         truth = view.read_truth_mask()

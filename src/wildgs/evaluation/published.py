@@ -1,12 +1,12 @@
-"""The paper's table 1, to print beside ours: Phototourism at half resolution, one RTX 3090."""
+"""Table 1 of the paper, to print beside measured scores: Phototourism at half resolution, one RTX 3090."""
 
 from __future__ import annotations
 
 PHOTOTOURISM = ("brandenburg_gate", "sacre_coeur", "trevi_fountain")
-"""The scenes' folders, as distributed."""
+"""Folder names of the scenes, as distributed."""
 
 LABELS = {"nerf-w": "NeRF-W", "ha-nerf": "Ha-NeRF", "cr-nerf": "CR-NeRF"}
-"""Methods of the table that are not part of this program."""
+"""Methods of the table that are not part of this package."""
 
 _METRICS = ("psnr", "ssim", "lpips")
 _TABLE: dict[str, tuple[float, ...]] = {
@@ -26,15 +26,15 @@ _TABLE: dict[str, tuple[float, ...]] = {
 
 
 def published_figures(scene: str, method: str) -> dict[str, float] | None:
-    """The paper's figures for a scene and method, by `metrics.json`'s names; protocol `full`.
+    """Published figures for a scene and method, by the names of `metrics.json`; protocol `full`.
 
     Args:
         scene: One of `PHOTOTOURISM`.
         method: A method of `wildgs bench`, or of `LABELS`.
 
     Returns:
-        ``psnr``, ``ssim``, ``lpips``, ``train_seconds`` and ``render_fps`` (the last two are one figure for
-        all three scenes); None for what the table does not hold.
+        ``psnr``, ``ssim``, ``lpips``, ``train_seconds`` and ``render_fps`` (the last two are one figure for all
+        three scenes); None if the table has no such row.
     """
     if scene not in PHOTOTOURISM or method not in _TABLE:
         return None

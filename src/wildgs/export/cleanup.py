@@ -1,4 +1,4 @@
-"""Smaller exports: Gaussians and harmonics left out, and what that costs."""
+"""Smaller exports: dropped Gaussians, truncated harmonics, and the PSNR that this costs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from wildgs.model.triplane import robust_box
 from wildgs.rasterize import rasterize
 
 BOX_QUANTILE = 0.02
-"""Share of the SfM points that a crop to the box leaves out on each side of each axis."""
+"""Share of the SfM points outside the crop box, on each side of each axis."""
 
 
 def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:
-    """Which Gaussians stay.
+    """Mask of the Gaussians that are kept.
 
     Args:
-        config: What to leave out.
-        splats: In the scene's aligned frame.
-        points: SfM points in the same frame; their median is the scene's middle.
+        config: What to drop.
+        splats: Gaussians in the aligned frame of the scene.
+        points: SfM points in the same frame.
     """
     keep = splats.opacities >= config.min_opacity
     if config.max_distance is not None:
@@ -45,13 +45,13 @@ def clean(
     points: Float[Tensor, "P 3"],
     viewpoints: Float[Tensor, "V 3"],
 ) -> Splats:
-    """The Gaussians without what the configuration leaves out.
+    """Gaussians after dropping and truncating as configured.
 
     Args:
-        config: What to leave out.
-        splats: In the scene's aligned frame.
-        points: SfM points.
-        viewpoints: Camera centres, to whose directions lower harmonics are fitted.
+        config: What to drop.
+        splats: Gaussians in the aligned frame of the scene.
+        points: SfM points in the same frame.
+        viewpoints: Camera centres; truncated harmonics are fitted to the directions from them.
     """
     kept = splats.select(kept_rows(config, splats, points)) if config.active else splats
     if config.sh_degree is None or num_sh_bases(config.sh_degree) >= kept.sh.shape[1]:
@@ -63,7 +63,7 @@ def clean(
 
 
 def agreement(first: Splats, second: Splats, cameras: Sequence[Camera]) -> float:
-    """PSNR between the pictures of two sets of Gaussians, dB: pooled over all cameras, infinite where equal."""
+    """PSNR in dB between the renders of two sets of Gaussians, pooled over all cameras; infinite if equal."""
     errors = []
     for camera in cameras:
         one, other = (_picture(splats, camera) for splats in (first, second))
@@ -73,7 +73,7 @@ def agreement(first: Splats, second: Splats, cameras: Sequence[Camera]) -> float
 
 @torch.no_grad()
 def _picture(splats: Splats, camera: Camera) -> Float[Tensor, "H W 3"]:
-    """As it is shown: rounded to 8 bits."""
+    """Render, rounded to 8 bits."""
     rendering = rasterize(
         splats.means, splats.quats, splats.scales, splats.opacities, splats.sh.contiguous(), camera,
         sh_degree=splats.sh_degree, near=NEAR, depth=False,

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CleanupConfig:
-    """What an export leaves out.
+    """What an export drops.
 
     Attributes:
-        min_opacity: Gaussians fainter than this are dropped.
-        max_distance: Gaussians further from the scene's middle are dropped, in units of the photos' usual depth;
+        min_opacity: Gaussians with a lower opacity are dropped.
+        max_distance: Gaussians further from the median of the SfM points are dropped. World units (the median depth
+            of the photos is 1); None keeps all.
+        crop: Gaussians outside the bounding box of nearly all SfM points, scaled by this factor, are dropped; None
+            keeps all.
+        sh_degree: Spherical harmonics are truncated to this degree, fitted to the viewing directions of the photos;
             None keeps all.
-        crop: Gaussians outside the box that holds nearly all SfM points, times this, are dropped: 1 is that
-            box; None keeps all.
-        sh_degree: Spherical harmonics above this degree are left out (fitted to the photos' directions).
     """
 
     min_opacity: float = 0.0
@@ -25,5 +26,5 @@ class CleanupConfig:
 
     @property
     def active(self) -> bool:
-        """Whether anything may be left out."""
+        """Whether anything may be dropped."""
         return self != CleanupConfig()

@@ -1,4 +1,4 @@
-"""Colours for depth maps."""
+"""Colour maps for depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NO_DEPTH = (128, 128, 128)
 
 
 def color_depth(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Paints depths by their disparity: near is bright, far is dark, no depth (0 or not finite) is grey."""
+    """Colour map of disparity: near is bright, far is dark, missing depth (0 or non-finite) is grey."""
     known = np.isfinite(depth) & (depth > 0.0)
     picture = np.empty((*depth.shape, 3), dtype=np.uint8)
     picture[:] = _NO_DEPTH

@@ -1,4 +1,4 @@
-"""Files that other programs read, each holding the scene under one light."""
+"""File formats of other programs; each file holds the scene under one appearance."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from wildgs.export.splats import Splats
 from wildgs.files import written_aside
 
 SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog"]
-"""By their endings: 3DGS's own, PlayCanvas's compressed one, antimatter15's, Niantic's, and PlayCanvas's SOG."""
+"""File extensions: 3DGS, PlayCanvas compressed PLY, antimatter15, Niantic SPZ, and PlayCanvas SOG."""
 
 _LEAST_OPACITY = 1e-6
 """Opacities closer to 0 or 1 have no finite logit in single precision."""
 
 _SPZ_HALF_RANGE = 2**23
-"""Coordinates in .spz are fixed-point numbers of 24 bits with a sign."""
+"""Coordinates in .spz are signed fixed-point numbers of 24 bits."""
 
 
 def write_splats(file: Path, splats: Splats, kind: SplatFormat) -> None:
-    """Writes Gaussians in a format.
+    """Writes Gaussians to a file.
 
-    `ply` loses nothing. The others quantise, and `splat` drops all harmonics but degree 0. Axes are those of the
-    Gaussians, which COLMAP and 3DGS programs take for x right, y down, z forward; only `spz`, which fixes x right,
-    y up, z back, is turned by half a turn about x, so that its readers see the same.
+    `ply` is lossless. The others quantise, and `splat` keeps harmonics of degree 0 only. The axes of the Gaussians
+    are kept; COLMAP and 3DGS programs read them as x right, y down, z forward. Only `spz`, which specifies x right,
+    y up, z backward, is rotated by 180 degrees about x.
 
     Args:
-        file: Where to; its folder is made where it is missing.
-        splats: In the frame in which they shall be read.
-        kind: The format.
+        file: File to write; missing folders are created.
+        splats: Gaussians in the frame of the file.
+        kind: File format.
 
     Raises:
-        UserError: The format needs a package that is not installed, or the package refuses.
+        UserError: The format needs a package that is not installed, or the package fails.
     """
     if kind in ("compressed.ply", "spz"):
         content = _by_gsply(splats, kind)
@@ -49,10 +49,10 @@ def write_splats(file: Path, splats: Splats, kind: SplatFormat) -> None:
 
 
 def ply_bytes(splats: Splats) -> bytes:
-    """The file's content.
+    """Content of a .ply file in the layout of the original 3DGS, which all 3DGS programs read.
 
-    Per Gaussian, as 32-bit floats: x y z, an unused normal, f_dc (degree 0, r g b), f_rest (the other harmonics,
-    all of red, then green, then blue), opacity (logit), scale (logarithm), rot (unit quaternion w x y z).
+    Per Gaussian, as 32-bit floats: x y z, an unused normal, f_dc (degree 0, r g b), f_rest (higher degrees: all of
+    red, then green, then blue), opacity (logit), scale (logarithm), rot (unit quaternion w x y z).
     """
     count = len(splats)
     rest = splats.sh[:, 1:].transpose(1, 2).reshape(count, -1)
@@ -89,10 +89,10 @@ def _by_gaussforge(splats: Splats, kind: SplatFormat) -> bytes:
 
 
 def _by_gsply(splats: Splats, kind: SplatFormat) -> bytes:
-    """The package takes harmonics coefficient by coefficient, and writes to files only."""
+    """Converts through files, since gsply has no other interface for both formats."""
     gsply = _package("gsply", kind)
     spz = kind == "spz"
-    placed = splats.turned(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats
+    placed = splats.rotated(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats
     write: Callable[..., Any] = gsply.write_spz if spz else gsply.plywrite
     options: dict[str, Any] = {"fractional_bits": _spz_bits(placed)} if spz else {"compressed": True}
     with TemporaryDirectory() as folder:
@@ -103,7 +103,7 @@ def _by_gsply(splats: Splats, kind: SplatFormat) -> bytes:
 
 
 def _spz_bits(splats: Splats) -> int:
-    """How many of the 24 bits can stand behind the point without the furthest Gaussian overflowing."""
+    """Number of fractional bits of the 24 with which the furthest Gaussian does not overflow."""
     reach = max(float(splats.means.abs().max()), 1e-6)
     bits = math.floor(math.log2((_SPZ_HALF_RANGE - 1) / reach))
     if bits < 0:
@@ -117,4 +117,6 @@ def _package(name: str, kind: SplatFormat) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise UserError(f".{kind} files need {name}; get it with `pip install 'wildgs[export]'`") from error
+        raise UserError(
+            f".{kind} files need {name}; install it with `pip install 'wildgs[export]'`"
+        ) from error

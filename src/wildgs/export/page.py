@@ -1,4 +1,4 @@
-"""One web page that holds a scene and its lights: opens from disk, asks nobody for anything."""
+"""A self-contained web page with a scene under several appearances: opens from disk, without server or network."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
 
 BUDGET_BYTES = 25_000_000
-"""Size below which the page stays by giving up degrees of the spherical harmonics."""
+"""Size limit of a page; degrees of the spherical harmonics are dropped to stay below it."""
 
 _MIDDLE = 0.3
-"""Half size of the central part of a picture, whose points tell the distance of the landmark."""
+"""Half size of the central part of a picture whose points give the distance of the landmark."""
 
 THUMBNAIL = (288, 192)
 _QUALITY = 82
@@ -40,9 +40,9 @@ class PageLight:
     """One light of the page.
 
     Attributes:
-        name: Below its thumbnail.
+        name: Caption of the thumbnail.
         sh: Spherical harmonics of all Gaussians.
-        thumbnail: A picture of any size; its middle is shown.
+        thumbnail: Picture of any size; its centre is shown.
     """
 
     name: str
@@ -52,11 +52,11 @@ class PageLight:
 
 @dataclass(frozen=True)
 class PageView:
-    """Where the page opens.
+    """Initial view of the page.
 
     Attributes:
-        camera: In the scene's aligned frame (+z up).
-        depth: How far before it lies what one orbits about, world units.
+        camera: Camera in the aligned frame of the scene (+z up).
+        depth: Depth of the centre of orbiting, world units.
     """
 
     camera: Camera
@@ -65,14 +65,14 @@ class PageView:
 
 @dataclass(frozen=True)
 class Page:
-    """All that the page shows.
+    """Content of a page.
 
     Attributes:
-        title: Its headline.
-        summary: A sentence behind its question mark.
-        splats: Geometry, in the scene's aligned frame.
-        lights: From left to right.
-        start: Where it opens.
+        title: Headline.
+        summary: Sentence in its help panel.
+        splats: Geometry, in the aligned frame of the scene.
+        lights: Appearances, from left to right.
+        start: Initial view.
         near: Near plane, world units.
     """
 
@@ -91,17 +91,17 @@ def write_page(
     viewpoints: Float[Tensor, "V 3"] | None = None,
     sh_degree: int | None = None,
 ) -> int:
-    """Writes the page, aside first and then renamed, so that no half page is ever left.
+    """Writes a page atomically.
 
     Args:
-        page: What to show.
-        file: The HTML file; its folder is made where it is missing.
-        viewpoints: Camera centres, for whose directions lower harmonics are fitted.
-        sh_degree: Degree of the spherical harmonics; None takes the highest with which the page stays below
+        page: Content.
+        file: HTML file; missing folders are created.
+        viewpoints: Camera centres; truncated harmonics are fitted to the directions from them.
+        sh_degree: Degree of the spherical harmonics; None takes the highest that keeps the page below
             `BUDGET_BYTES`.
 
     Returns:
-        The degree of the spherical harmonics that the page carries.
+        Degree of the spherical harmonics in the page.
 
     Raises:
         ValueError: The page has no light or no Gaussian.
@@ -145,7 +145,7 @@ def _compose(page: Page, scene: PackedScene) -> str:
 
 
 def script_json(value: Any) -> str:
-    """JSON that ends no script element, whatever a photo is called."""
+    """JSON that cannot close the enclosing script element, whatever file names it contains."""
     return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -161,7 +161,7 @@ def _start(view: PageView) -> dict[str, Any]:
 
 
 def _thumbnail(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
-    """The picture's middle as a data URL."""
+    """Centre crop of a picture as a data URL."""
     image = Image.fromarray(np.ascontiguousarray(pixels))
     wide, tall = THUMBNAIL
     scale = max(wide / image.width, tall / image.height)
@@ -174,14 +174,14 @@ def _thumbnail(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
 
 
 def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tuple[int, float]:
-    """The camera that shows most of the scene, as large as it fits, and the distance of what it looks at.
+    """Chooses the photo from which the landmark is seen whole and large.
 
     Args:
-        cameras: Of the training photos, at least one.
+        cameras: Cameras of the training photos, at least one.
         points: SfM points in the same frame.
 
     Returns:
-        Index of the camera, and the depth of the landmark before it in world units.
+        Index of the camera, and the depth of the landmark in it, world units.
     """
     scores = torch.tensor([_score(camera, points) for camera in cameras])
     best = int(scores.argmax())
@@ -189,16 +189,16 @@ def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tup
 
 
 def _project(camera: Camera, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
-    """Places in the picture (0 to 1 on each axis) and depths of the points before the camera."""
+    """Image coordinates (0 to 1 on each axis) and depths of the points in front of the camera."""
     pixels, depths = camera.project(points)
     before = depths > 1e-3
     return pixels[before] / torch.tensor([camera.width, camera.height]).to(points), depths[before]
 
 
 def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Share of the points that the picture shows, times the share of the picture over which most of them spread.
+    """Share of the points inside the picture, times the share of the picture that they cover.
 
-    The first falls when the camera stands too near, the second when it stands too far.
+    The first factor is small for cameras that are too close, the second for those too far away.
     """
     places, _ = _project(camera, points)
     inside = places[((places >= 0) & (places <= 1)).all(dim=1)]
@@ -209,7 +209,7 @@ def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
 
 
 def _depth(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Median depth of the points in the picture's middle."""
+    """Median depth of the points in the central part of the picture."""
     places, depths = _project(camera, points)
     middle = ((places - 0.5).abs() < _MIDDLE).all(dim=1)
     chosen = depths[middle] if bool(middle.any()) else depths

@@ -1,14 +1,14 @@
-"""The scene inside the web page: geometry once, then the colours of each light, in few bytes.
+"""Binary encoding of the scene inside the web page: the geometry once, then the colours of each appearance.
 
-Everything is quantised to bytes and stored in planes (all first bytes, then all second bytes, ...), Gaussians in
-Morton order, so that neighbours in space are neighbours in the file and gzip finds what they share. Lights after
-the first are stored as differences from it, modulo 256. `web/src/scene.js` reads this.
+Everything is quantised to bytes and stored in planes (all first bytes, then all second bytes, ...), with Gaussians
+in Morton order, so that neighbours in space are neighbours in the file and gzip compresses well. Appearances after
+the first are stored as differences from it, modulo 256. `web/src/scene.js` is the decoder.
 
-    means      asinh of each coordinate, 24 bits between the least and the largest, high byte first
+    means      asinh of each coordinate, 24 bits between minimum and maximum, high byte first
     scales     logarithm, 8 bits
     opacities  8 bits
-    quats      the three smallest of (x, y, z, w) in 10 bits each, which one is left out in 2; low byte first
-    light<i>   spherical harmonics, 8 bits, a range per degree; base function by base function, r g b each
+    quats      the three smallest of (x, y, z, w) in 10 bits each, the index of the largest in 2; low byte first
+    light<i>   spherical harmonics, 8 bits, one range per degree; by basis function, r g b each
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ from wildgs.export.splats import Splats
 from wildgs.geometry.morton import morton_order
 
 _TAIL = 2e-4
-"""Share of a light's coefficients beyond either end of a range: they are drawn in, so that the others get finer
-steps."""
+"""Share of the coefficients that is clipped at either end of a range, for finer steps within it."""
 
 Planes = list[tuple[str, UInt8[np.ndarray, "C N"]]]
 
 
 @dataclass(frozen=True)
 class PackedScene:
-    """A scene as the page carries it.
+    """Encoded scene.
 
     Attributes:
         header: Counts and ranges, for JSON.
-        data: The planes, gzipped.
+        data: All planes, compressed by gzip.
     """
 
     header: dict[str, Any]
@@ -45,14 +44,14 @@ class PackedScene:
 
 
 def pack_scene(splats: Splats, lights: Sequence[Float[np.ndarray, "N K 3"]]) -> PackedScene:
-    """Packs geometry and the colours of all lights.
+    """Encodes the geometry and the colours under all appearances.
 
     Args:
-        splats: The geometry; its own colours are not read.
-        lights: Spherical harmonics under each light, all of one degree.
+        splats: Geometry; its own harmonics are ignored.
+        lights: Spherical harmonics of each appearance, all of one degree.
 
     Raises:
-        ValueError: No light, or no Gaussian.
+        ValueError: There is no appearance, or no Gaussian.
     """
     if not lights or not len(splats):
         raise ValueError("a page needs at least one light and one Gaussian")
@@ -88,7 +87,7 @@ def _pack_scales(scales: Float[np.ndarray, "N 3"]) -> tuple[dict[str, Any], UInt
 
 
 def _pack_quats(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "4 N"]:
-    """Smallest three; quats are (w, x, y, z) here and (x, y, z, w) in the page."""
+    """Smallest-three encoding of (w, x, y, z) quaternions, as (x, y, z, w)."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
     largest = np.abs(unit).argmax(axis=1)
@@ -103,7 +102,7 @@ def _pack_quats(quats: Float[np.ndarray, "N 4"]) -> UInt8[np.ndarray, "4 N"]:
 def _pack_lights(
     lights: Sequence[Float[np.ndarray, "N K 3"]],
 ) -> tuple[dict[str, Any], list[UInt8[np.ndarray, "C N"]]]:
-    """Codes of all lights in ranges that they share, so that the page can mix them."""
+    """Codes of all appearances in shared ranges, so that the page can interpolate them."""
     bases = lights[0].shape[1]
     least, step = [], []
     codes = [np.empty((3 * bases, light.shape[0]), np.uint8) for light in lights]
@@ -122,7 +121,7 @@ def _pack_lights(
 
 
 def _range(values: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Where nearly all values of every light lie."""
+    """Range of nearly all values of every appearance."""
     ends = np.stack([np.quantile(value, [_TAIL, 1 - _TAIL]) for value in values])
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
     return low, max(high, low + 1e-6)

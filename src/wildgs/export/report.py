@@ -1,4 +1,4 @@
-"""A run's report: one HTML file with its scores and pictures inside, opened without server or network."""
+"""Report of a run: one HTML file with scores and embedded pictures, which opens without server or network."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class ReportExample:
     """Pictures of one view.
 
     Attributes:
-        name: Of the photo.
-        photo: As taken.
-        render: The scene from there under the photo's own light.
-        mask: Visibility: 255 = static, 0 = transient.
-        depth: Rendered depth in world units (0 or not finite = none), or a picture of it.
-        clean: The photo without its transients, where it is known.
-        baseline: The baseline's render.
-        relit: Name of another photo, that photo (of any size), and this view under its light.
-        baseline_name: What to call the baseline.
+        name: Name of the photo.
+        photo: The photo.
+        render: Render of this view under the appearance of the photo.
+        mask: Visibility mask, 255 = static, 0 = transient.
+        depth: Rendered depth in world units (0 or non-finite = none), or a picture of it.
+        clean: The photo without its transients, if known.
+        baseline: Render of the baseline.
+        relit: Renders under other appearances: name of the other photo, that photo (of any size), and the render.
+        baseline_name: Name of the baseline.
     """
 
     name: str
@@ -55,11 +55,11 @@ class ReportExample:
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page shows.
+    """Content of a report.
 
     Attributes:
-        title: Its headline.
-        summary: A paragraph below it.
+        title: Headline.
+        summary: Paragraph below the headline.
         methods: Rows of the table of scores.
         examples: Views, from top to bottom.
     """
@@ -71,11 +71,11 @@ class Report:
 
 
 def write_report(report: Report, file: Path) -> None:
-    """Writes the page, aside first and then renamed, so that no half page is ever left.
+    """Writes a report atomically.
 
     Args:
-        report: What to show.
-        file: The HTML file; its folder is made where it is missing.
+        report: Content.
+        file: HTML file; missing folders are created.
     """
     template = files("wildgs.export").joinpath("report_template.html").read_text(encoding="utf-8")
     page = Template(template).substitute(
@@ -83,7 +83,7 @@ def write_report(report: Report, file: Path) -> None:
         summary=escape(report.summary),
         scores=scores_section(report.methods),
         examples=_examples(report.examples),
-        footer="Written by Wild-GS. The pictures are part of this file; nothing is loaded from elsewhere.",
+        footer="Written by Wild-GS. All pictures are embedded; nothing is loaded from the network.",
     )
     with written_aside(file) as aside:
         aside.write_text(page, encoding="utf-8")
@@ -94,8 +94,8 @@ def _examples(examples: Sequence[ReportExample]) -> str:
         return ""
     return (
         '<section><h2>Views</h2><p class="hint">Drag the line to compare the photo with the render. '
-        "In the mask, white is what the method takes for the scene and black what it takes for passers-by. "
-        "In the depth picture, bright is near.</p>" + "".join(map(_example, examples)) + "</section>"
+        "In the mask, white is predicted to be static and black transient (passers-by). In the depth map, "
+        "bright is near.</p>" + "".join(map(_example, examples)) + "</section>"
     )
 
 
@@ -106,7 +106,7 @@ def _example(example: ReportExample) -> str:
         ("Depth", f"Rendered depth of {name}", _depth_picture(example.depth)),
     ]
     if example.clean is not None:
-        tiles.insert(0, ("Photo without passers-by (truth)", f"{name} without its passers-by", example.clean))
+        tiles.insert(0, ("Ground truth without transients", f"{name} without transients", example.clean))
     if example.baseline is not None:
         caption = f"{escape(example.baseline_name)}, for comparison"
         tiles.append((caption, f"{name} rendered by {escape(example.baseline_name)}", example.baseline))
@@ -115,7 +115,7 @@ def _example(example: ReportExample) -> str:
         for caption, alt, pixels in tiles
     )
     height, width = example.photo.shape[:2]
-    # Beside an upright photo there is room for all other pictures; beside a wide one only for the tiles.
+    # All other pictures fit beside a portrait photo, only the tiles beside a landscape one.
     wide = width >= height
     columns, tall, least = (2, "430px", "240px") if wide else (min(len(tiles), 4), "560px", "150px")
     layout = f"--ratio:{width / height:.4f};--columns:{columns};--tall:{tall};--least:{least}"
@@ -131,16 +131,16 @@ def _depth_picture(depth: np.ndarray) -> Photo:
 
 
 def _compare(example: ReportExample) -> str:
-    """The photo over the render, with a line to drag."""
+    """Photo over render, with a slider between them."""
     name = escape(example.name)
     return (
         '<figure class="compare"><div class="stage">'
-        f"{_picture(example.render, f'Render of {name} under its own light')}"
+        f"{_picture(example.render, f'Render of {name} under its own appearance')}"
         f"{_picture(example.photo, f'Photo {name}', css='above')}"
         '<span class="knob" aria-hidden="true">&#8596;</span>'
         '<span class="tag left">photo</span><span class="tag right">render</span>'
         f'<input type="range" min="0" max="100" value="50" aria-label="Share of {name} that shows the photo">'
-        "</div><figcaption>Photo and render under the photo&#x27;s own light</figcaption></figure>"
+        "</div><figcaption>Photo, and render under the appearance of the photo</figcaption></figure>"
     )
 
 
@@ -154,17 +154,17 @@ def _relit(example: ReportExample) -> str:
         small.thumbnail((160, 160))
         figures.append(
             f'<figure><div class="pair">'
-            f"{_picture(pixels, f'{escape(example.name)} rendered under the light of {light}')}"
-            f"{_picture(np.asarray(small), f'Photo {light}, whose light it is', css='source')}"
-            f"</div><figcaption>light of {light}</figcaption></figure>"
+            f"{_picture(pixels, f'{escape(example.name)} rendered under the appearance of {light}')}"
+            f"{_picture(np.asarray(small), f'Photo {light}, the source of the appearance', css='source')}"
+            f"</div><figcaption>appearance of {light}</figcaption></figure>"
         )
     return (
-        f'<h4>The same view under the light of other photos</h4><div class="relit">{"".join(figures)}</div>'
+        f'<h4>This view under the appearance of other photos</h4><div class="relit">{"".join(figures)}</div>'
     )
 
 
 def _picture(pixels: Photo, alt: str, css: str = "") -> str:
-    """An image element with its data inside; `alt` is escaped already."""
+    """An image element with embedded data; `alt` must be escaped."""
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "JPEG", quality=_QUALITY, subsampling=0)
     data = base64.b64encode(buffer.getvalue()).decode("ascii")

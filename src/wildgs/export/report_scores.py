@@ -1,4 +1,4 @@
-"""The report's table of scores."""
+"""Table of scores of the report."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ from typing import Any
 _DASH = "–"
 _METRICS = (("psnr", "PSNR (dB)", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3))
 _PROTOCOLS = {
-    "full": ("Whole photo", "the light is taken from the whole test photo, which is scored as a whole"),
-    "half": (
-        "Half photo",
-        "the light is taken from the left half of the test photo, the right half is scored",
-    ),
+    "full": ("Protocol full", "appearance from the whole test photo, scored on the whole photo"),
+    "half": ("Protocol half", "appearance from the left half of the test photo, scored on the right half"),
 }
 
 
@@ -23,14 +20,14 @@ class MethodScores:
     """Scores of one method.
 
     Attributes:
-        name: Of the method.
-        scores: Per protocol ("full", "half"), the mean of each metric; None where it could not be computed.
+        name: Name of the method.
+        scores: Per protocol ("full", "half"), the mean of each metric; None if it could not be computed.
         steps: Training steps.
         train_seconds: Training time.
-        num_gaussians: At the end of training.
-        render_fps: Frames per second.
-        device: On which it trained and rendered.
-        notes: What a reader of the scores has to know, such as why a metric is missing.
+        num_gaussians: Number of Gaussians at the end of training.
+        render_fps: Rendered frames per second.
+        device: Device of training and rendering.
+        notes: Remarks on the scores, such as why a metric is missing.
     """
 
     name: str
@@ -46,12 +43,12 @@ class MethodScores:
     def from_metrics(
         cls, name: str, metrics: Mapping[str, Mapping[str, Any]], steps: int | None = None
     ) -> MethodScores:
-        """Takes scores from the contents of `metrics.json` files.
+        """Scores from the content of `metrics.json` files.
 
         Args:
-            name: Of the method.
-            metrics: Contents by protocol.
-            steps: Training steps; by default the step that the files state.
+            name: Name of the method.
+            metrics: Content by protocol.
+            steps: Training steps; by default those of the files.
         """
         any_file: Mapping[str, Any] = next(iter(metrics.values()), {})
         notes = [note for content in metrics.values() for note in _as_lines(content.get("notes"))]
@@ -71,7 +68,7 @@ class MethodScores:
 
 
 def scores_section(methods: Sequence[MethodScores]) -> str:
-    """The section with the table and the notes below it, as HTML."""
+    """HTML of the section with table and notes."""
     if not methods:
         return ""
     protocols = [p for p in _PROTOCOLS if any(p in method.scores for method in methods)]
@@ -87,7 +84,7 @@ def scores_section(methods: Sequence[MethodScores]) -> str:
     meaning = "; ".join(f"{_PROTOCOLS[p][0].lower()}: {_PROTOCOLS[p][1]}" for p in protocols)
     hint = f"Means over the held-out photos ({escape(meaning)}). " if protocols else ""
     return (
-        f'<section><h2>Scores</h2><p class="hint">{hint}Higher PSNR and SSIM, lower LPIPS are better.</p>'
+        f'<section><h2>Scores</h2><p class="hint">{hint}Higher PSNR and SSIM and lower LPIPS are better.</p>'
         '<div class="scroll" tabindex="0" role="region" aria-label="Table of scores"><table><thead>'
         f'<tr><th scope="col" rowspan="2">Method</th>{groups}{facts}</tr><tr>{columns}</tr></thead>'
         f"<tbody>{rows}</tbody></table></div>{_notes(methods)}</section>"
@@ -121,7 +118,7 @@ def _row(method: MethodScores, methods: Sequence[MethodScores], protocols: Seque
 
 
 def _is_best(value: float, key: str, protocol: str, methods: Sequence[MethodScores]) -> bool:
-    """Whether no other method has a better value; with nothing to compare, none is best."""
+    """Whether a value is the best of several methods; False if there is only one."""
     values = [method.scores.get(protocol, {}).get(key) for method in methods]
     known = [v for v in values if v is not None]
     return len(known) > 1 and value == (min(known) if key == "lpips" else max(known))
@@ -132,7 +129,7 @@ def _number(value: float | int | None, digits: int) -> str:
 
 
 def _notes(methods: Sequence[MethodScores]) -> str:
-    """Notes below the table; those that all methods share are said once."""
+    """Notes below the table; notes that all methods share are listed once."""
     by_note: dict[str, list[str]] = {}
     for method in methods:
         device = (f"measured on {method.device}",) if method.device else ()
@@ -150,7 +147,7 @@ def _as_float(value: Any) -> float | None:
 
 
 def _as_lines(notes: Any) -> Iterable[str]:
-    """Notes as lines, whether they were stored as one line, several, or by metric."""
+    """Notes as lines, from one line, several lines, or lines by metric."""
     if not notes:
         return ()
     if isinstance(notes, Mapping):

@@ -1,4 +1,4 @@
-"""Contact sheets: a grid of pictures with words along its top and side, as one picture."""
+"""Contact sheets: a grid of pictures with captions, as one picture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Picture = UInt8[np.ndarray, "_ _ 3"]
 
 
 def fit(picture: Picture, width: int, height: int) -> Image.Image:
-    """The whole picture within a tile, on paper where its shape differs."""
+    """Fits a picture into a tile, padded where its aspect ratio differs."""
     image = Image.fromarray(picture)
     scale = min(width / image.width, height / image.height)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
@@ -32,12 +32,12 @@ def contact_sheet(
     *,
     tile: tuple[int, int],
 ) -> Image.Image:
-    """Pictures in rows and columns, each column with its caption above.
+    """Pictures in rows and columns, with a caption above each column.
 
     Args:
-        rows: Pictures, None for an empty place; all rows of one length.
-        captions: Of the columns.
-        tile: Width and height of a place; pictures are fitted into it, not stretched.
+        rows: Pictures, None for an empty tile; all rows of one length.
+        captions: Captions of the columns.
+        tile: Width and height of a tile in pixels; the aspect ratio of pictures is kept.
     """
     width, height = tile
     letters = max(10, round(height * 0.075))
@@ -61,7 +61,7 @@ def contact_sheet(
 
 
 def shorten(words: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:
-    """Words that fit a width, with an ellipsis in their middle where they did not."""
+    """Shortens a caption to a width in pixels by an ellipsis in its middle."""
     if font.getlength(words) <= width:
         return words
     for kept in range(len(words) - 1, 1, -1):

@@ -1,4 +1,4 @@
-"""Gaussians baked for export: plain arrays, whatever trained them."""
+"""Gaussians for export, as plain arrays that do not depend on the method."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from wildgs.scene.scene import Alignment
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians under one light.
+    """Gaussians under one appearance.
 
     Attributes:
         means: Centres, world units.
-        quats: Orientations (w, x, y, z), of any length but 0.
-        scales: Standard deviations along the own axes, world units, linear.
-        opacities: In [0, 1], linear.
-        sh: Spherical harmonics, 1, 4, 9 or 16 per channel.
+        quats: Orientations (w, x, y, z), not necessarily normalised.
+        scales: Standard deviations along the principal axes, world units, linear.
+        opacities: Opacities in [0, 1], linear.
+        sh: Spherical harmonics, 1, 4, 9 or 16 coefficients per channel.
     """
 
     means: Float[Tensor, "N 3"]
@@ -40,27 +40,27 @@ class Splats:
         return sh_degree(self.sh)
 
     def select(self, keep: Bool[Tensor, " N"]) -> Splats:
-        """Those Gaussians that are True in `keep`."""
+        """The Gaussians that are True in `keep`."""
         return Splats(
             self.means[keep], self.quats[keep], self.scales[keep], self.opacities[keep], self.sh[keep]
         )
 
     def with_sh(self, sh: Float[Tensor, "N K 3"]) -> Splats:
-        """The same Gaussians in other colours."""
+        """The same Gaussians with other spherical harmonics."""
         return replace(self, sh=sh)
 
     def to_input_frame(self, alignment: Alignment) -> Splats:
-        """The Gaussians in the frame in which the scene came, its origin, axes and scale.
+        """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale.
 
         Args:
-            alignment: From the input's frame to that of the Gaussians.
+            alignment: Transform from the frame of the input to that of the Gaussians.
         """
         back = alignment.inverse()
-        turned = self.turned(back.rotation)
-        return replace(turned, means=back.apply_points(self.means), scales=self.scales * back.scale)
+        rotated = self.rotated(back.rotation)
+        return replace(rotated, means=back.apply_points(self.means), scales=self.scales * back.scale)
 
-    def turned(self, rotation: Float[Tensor, "3 3"]) -> Splats:
-        """The Gaussians after a turn of the world about its origin, colours included."""
+    def rotated(self, rotation: Float[Tensor, "3 3"]) -> Splats:
+        """The Gaussians after a rotation of the world about its origin, including their harmonics."""
         turn = rotations_to_quats(rotation[None]).to(self.quats)
         return Splats(
             means=self.means @ rotation.to(self.means).T,
@@ -72,7 +72,7 @@ class Splats:
 
 
 def _multiply(first: Float[Tensor, "_ 4"], second: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
-    """Hamilton product of quaternions (w, x, y, z): `second` turned by `first`."""
+    """Hamilton product of quaternions (w, x, y, z): `second` rotated by `first`."""
     a, v = first[:, :1], first[:, 1:].expand(len(second), 3)
     b, u = second[:, :1], second[:, 1:]
     real = a * b - (v * u).sum(dim=1, keepdim=True)

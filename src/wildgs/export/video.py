@@ -1,4 +1,4 @@
-"""Frames to a video file or a folder of PNGs; nothing half-written ever has the final name."""
+"""Writes frames to a video file or a folder of PNGs, atomically."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from wildgs.errors import UserError
 from wildgs.files import written_aside
 
 MUXERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
-"""ffmpeg's container formats by file ending."""
+"""Container formats of ffmpeg by file extension."""
 
 SUFFIXES = tuple(MUXERS)
 OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
-"""Endings by which someone asks for a file that is not written here, not for a folder."""
+"""Extensions of unsupported files, which are not mistaken for folder names."""
 
 ENCODING: dict[str, Any] = {
     "codec": "libx264",
@@ -29,28 +29,30 @@ ENCODING: dict[str, Any] = {
     "macro_block_size": 2,
     "output_params": ["-crf", "18", "-movflags", "+faststart"],
 }
-"""H.264 that plays everywhere, at a quality that is hard to tell from the frames."""
+"""H.264 that plays in all browsers, visually lossless."""
 
 Frames = Iterable[UInt8[np.ndarray, "H W 3"]]
 
 
 def is_video(path: Path) -> bool:
-    """Whether a name asks for a video file rather than a folder."""
+    """Whether a path names a video file rather than a folder."""
     return path.suffix.lower() in SUFFIXES
 
 
 def check_output(path: Path) -> None:
-    """Finds mistakes before hours of rendering.
+    """Checks an output path before rendering starts.
 
     Raises:
-        UserError: The name is of a video that cannot be written, or what a video needs is not installed.
+        UserError: The video format is not supported, or imageio-ffmpeg is not installed.
     """
     if path.suffix.lower() in OTHER_MEDIA:
         known = ", ".join(SUFFIXES)
-        raise UserError(f"{path}: videos end in {known}; a name without an ending makes a folder of PNGs")
+        raise UserError(
+            f"{path}: unsupported file type; use {known}, or a name without extension for a folder of PNGs"
+        )
     if is_video(path):
         if path.is_dir():
-            raise UserError(f"{path}: is a folder; give the name of a video file")
+            raise UserError(f"{path} is a folder; give the name of a video file")
         _ffmpeg()
 
 
@@ -59,22 +61,22 @@ def _ffmpeg() -> Any:
         import imageio_ffmpeg
     except ImportError as error:
         raise UserError(
-            "videos need imageio-ffmpeg: `pip install imageio-ffmpeg`; or give --output a folder for PNG frames"
+            "videos need imageio-ffmpeg (`pip install imageio-ffmpeg`); or set --output to a folder for PNG frames"
         ) from error
     return imageio_ffmpeg
 
 
 def write_frames(path: Path, frames: Frames, size: tuple[int, int], fps: float) -> None:
-    """Writes a video (H.264, plays everywhere) or, for a name without an ending, a folder of PNGs.
+    """Writes a video (H.264) or, for a name without extension, a folder of PNGs.
 
     Args:
-        path: File or folder.
-        frames: Pictures, taken one by one: they may be rendered as they are written.
-        size: Width and height of all of them; even numbers for a video.
+        path: Video file or folder.
+        frames: Pictures, consumed one by one: they may be rendered as they are written.
+        size: Width and height of all frames in pixels; even numbers for a video.
         fps: Frames per second.
 
     Raises:
-        UserError: See `check_output`; or the video cannot be encoded.
+        UserError: As `check_output` raises, or the video cannot be encoded.
     """
     check_output(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,7 +88,7 @@ def write_frames(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
 
 def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) -> None:
     if size[0] % 2 or size[1] % 2:
-        raise UserError(f"{size[0]} x {size[1]}: a video's width and height must be even numbers")
+        raise UserError(f"{size[0]} x {size[1]}: width and height of a video must be even")
     encoding = ENCODING | {"output_params": [*ENCODING["output_params"], "-f", MUXERS[path.suffix.lower()]]}
     with written_aside(path) as aside:
         writer = _ffmpeg().write_frames(str(aside), size, fps=fps, **encoding)
@@ -102,7 +104,7 @@ def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
 
 def _write_folder(path: Path, frames: Frames) -> None:
     if path.exists() and not path.is_dir():
-        raise UserError(f"{path}: is a file; give a folder for the frames")
+        raise UserError(f"{path} is a file; give a folder for the frames")
     with _aside(path) as folder:
         for number, frame in enumerate(frames):
             Image.fromarray(np.ascontiguousarray(frame)).save(folder / f"frame_{number:05d}.png")
@@ -115,7 +117,7 @@ def _write_folder(path: Path, frames: Frames) -> None:
 
 @contextmanager
 def _aside(path: Path) -> Iterator[Path]:
-    """A hidden folder on the same disk, gone afterwards whatever happens."""
+    """A temporary folder on the same file system."""
     folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.part."))
     try:
         yield folder

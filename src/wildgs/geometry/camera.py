@@ -1,4 +1,4 @@
-"""Pinhole cameras: one convention for the whole house."""
+"""Pinhole cameras, in the one convention of the package."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 class Camera:
     """A pinhole camera without distortion.
 
-    Axes are OpenCV's and COLMAP's: x right, y down, z forward. The centre of the top left pixel lies at
-    (0.5, 0.5), so a point in front of the camera projects to ``K @ (x / z, y / z, 1)`` in pixels.
+    Axes as in OpenCV and COLMAP: x right, y down, z forward. The centre of the top left pixel is (0.5, 0.5), and a
+    point in front of the camera projects to ``K @ (x / z, y / z, 1)`` in pixels.
 
     Attributes:
         viewmat: World-to-camera rigid transform.
@@ -30,17 +30,17 @@ class Camera:
 
     @property
     def position(self) -> Float[Tensor, "3"]:
-        """The camera's centre in world coordinates."""
+        """Camera centre in world coordinates."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     @property
     def forward(self) -> Float[Tensor, "3"]:
-        """The viewing direction (unit length) in world coordinates."""
+        """Viewing direction (unit length) in world coordinates."""
         return self.viewmat[2, :3]
 
     @property
     def up(self) -> Float[Tensor, "3"]:
-        """The upward direction of the picture (unit length) in world coordinates."""
+        """Up direction of the image (unit length) in world coordinates."""
         return -self.viewmat[1, :3]
 
     def to(self, device: torch.device | str) -> Camera:
@@ -48,46 +48,46 @@ class Camera:
         return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view sampled on another pixel grid; intrinsics follow per axis."""
+        """The same view at another resolution; intrinsics are scaled per axis."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return replace(self, K=self.K * scale[:, None], width=width, height=height)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The part of the picture that starts at pixel (left, top)."""
+        """The crop of the image that starts at pixel (left, top)."""
         K = self.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
         return replace(self, K=K, width=width, height=height)
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
-        """Where the picture has world points.
+        """Projects world points.
 
         Args:
             points: World coordinates.
 
         Returns:
-            Pixel coordinates (x, y), without meaning where the depth is not positive, and depths along the
-            camera's z axis.
+            Pixel coordinates (x, y), undefined where the depth is not positive, and depths along the z axis of the
+            camera.
         """
         seen = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         pixels = seen @ self.K.T
         return pixels[:, :2] / pixels[:, 2:], seen[:, 2]
 
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
-        """World points of all pixels at the given depths.
+        """Back-projects all pixels.
 
         Args:
-            depth: Distance along the camera's z axis (not along the ray), world units.
+            depth: Depth along the z axis of the camera (not along the ray), world units.
 
         Returns:
-            World coordinates of every pixel's centre at its depth.
+            World coordinates of all pixel centres at these depths.
         """
         rays = self.pixel_rays()
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
         return (rays * depth[..., None] - translation) @ rotation
 
     def pixel_rays(self) -> Float[Tensor, "H W 3"]:
-        """Camera-space rays through the pixels' centres, scaled so that z = 1."""
+        """Camera-space rays through the pixel centres, scaled to z = 1."""
         x = (torch.arange(self.width, device=self.K.device) + 0.5 - self.K[0, 2]) / self.K[0, 0]
         y = (torch.arange(self.height, device=self.K.device) + 0.5 - self.K[1, 2]) / self.K[1, 1]
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")

@@ -1,4 +1,4 @@
-"""Camera files: our documented JSON (docs/cameras.md), and nerfstudio's camera paths."""
+"""Camera files: the JSON format of docs/cameras.md, and camera paths of nerfstudio."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from wildgs.files import written_aside
 from wildgs.geometry.camera import Camera
 
 Frame = Literal["scene", "colmap"]
-"""Whose world coordinates: the run's aligned ones (+z up, usual depth 1), or those of the COLMAP model."""
+"""World frame: the aligned frame of the run (+z up, median depth 1), or that of the COLMAP model."""
 
 FORMAT = "wildgs-cameras-1"
 DATAPARSER_FILE = "dataparser_transforms.json"
 DEFAULT_FPS = 30.0
 MAX_SIDE = 32_768
-"""Of a picture, pixels: what a file asks for is allocated."""
+"""Upper bound on width and height in pixels, since images of this size are allocated."""
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A trajectory from a file.
+    """A camera path from a file.
 
     Attributes:
-        cameras: One for every frame; their pictures are of one size.
+        cameras: One per video frame, all of one size.
         fps: Frames per second.
-        frame: The world in which they stand.
+        frame: World frame of the cameras.
     """
 
     cameras: tuple[Camera, ...]
@@ -43,7 +43,7 @@ class CameraPath:
 
 
 def write_camera_path(file: Path, cameras: Sequence[Camera], *, fps: float, frame: Frame = "scene") -> None:
-    """Writes our JSON.
+    """Writes cameras in the format of docs/cameras.md.
 
     Raises:
         UserError: The disk is full or read-only.
@@ -67,10 +67,10 @@ def write_camera_path(file: Path, cameras: Sequence[Camera], *, fps: float, fram
 
 
 def read_camera_path(file: Path) -> CameraPath:
-    """Reads our JSON or nerfstudio's, by what it holds.
+    """Reads a camera file of either format, which is detected.
 
     Raises:
-        UserError: The file is missing, no JSON, or not a camera file; the message names the entry.
+        UserError: The file is missing or not a valid camera file; the message names the entry.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -84,12 +84,12 @@ def read_camera_path(file: Path) -> CameraPath:
         elif isinstance(content, dict) and "cameras" in content:
             path = _from_own(content)
         else:
-            raise ValueError("holds neither 'cameras' (ours) nor 'camera_path' (nerfstudio's)")
+            raise ValueError("neither 'cameras' (Wild-GS) nor 'camera_path' (nerfstudio) is there")
     except (KeyError, TypeError, ValueError, OSError, OverflowError, RecursionError) as error:
-        reason = f"there is no entry {error}" if isinstance(error, KeyError) else error
-        raise UserError(f"{file}: is no camera file: {reason} (docs/cameras.md describes it)") from error
+        reason = f"missing entry {error}" if isinstance(error, KeyError) else error
+        raise UserError(f"{file}: not a valid camera file: {reason} (see docs/cameras.md)") from error
     if not path.cameras:
-        raise UserError(f"{file}: holds no cameras")
+        raise UserError(f"{file}: contains no cameras")
     return path
 
 
@@ -108,10 +108,10 @@ def _from_own(content: dict[str, Any]) -> CameraPath:
 
 
 def _from_nerfstudio(content: dict[str, Any], transforms: Path) -> CameraPath:
-    """Nerfstudio's path: camera-to-world with OpenGL axes, vertical field of view.
+    """Camera path of nerfstudio: camera-to-world with OpenGL axes, vertical field of view.
 
-    Its world is that of its data parser. Where the parser's transform lies beside the file, cameras go back to
-    the COLMAP model's frame; else they are taken to be in this run's.
+    Its world frame is that of its data parser. If the transform of the parser is beside the file, cameras are
+    transformed to the frame of the COLMAP model; otherwise they are assumed to be in the frame of this run.
     """
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
@@ -128,8 +128,8 @@ def _from_nerfstudio(content: dict[str, Any], transforms: Path) -> CameraPath:
         pose = back @ _matrix(entry["camera_to_world"], (4, 4), f"camera_path[{number}]")
         volume = np.linalg.det(pose[:3, :3])
         if not 1e-18 < abs(volume) < 1e18:
-            raise ValueError(f"camera_path[{number}]: the pose is no rotation")
-        pose[:3, :3] /= np.cbrt(volume)  # the parser's scale moves, it does not magnify
+            raise ValueError(f"camera_path[{number}]: the pose is not a rigid transform")
+        pose[:3, :3] /= np.cbrt(volume)  # the scale of the parser applies to positions only
         pose[:3, 1:3] *= -1  # OpenGL's y up and z backward to OpenCV's
         K = _from_fov(entry["fov"], width, height)
         cameras.append(_camera(np.linalg.inv(pose), K, width, height))
@@ -141,20 +141,20 @@ def _camera(
 ) -> Camera:
     rotation = viewmat[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError("a camera's pose is no rotation and translation")
+        raise ValueError("a camera pose is not a rigid transform")
     return Camera(torch.from_numpy(viewmat), torch.from_numpy(K), width, height)
 
 
 def _list(value: Any, where: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise ValueError(f"{where} is no list of cameras")
+        raise ValueError(f"{where} is not a list of cameras")
     return value
 
 
 def _matrix(value: Any, shape: tuple[int, int], where: str) -> np.ndarray:
     matrix = np.array(value, dtype=np.float64)
     if matrix.size != shape[0] * shape[1] or not np.isfinite(matrix).all():
-        raise ValueError(f"{where} needs {shape[0]} x {shape[1]} numbers")
+        raise ValueError(f"{where}: expected {shape[0]} x {shape[1]} finite numbers")
     return matrix.reshape(shape)
 
 
@@ -165,14 +165,14 @@ def _whole(value: Any, where: str) -> int:
         or not 1 <= value <= MAX_SIDE
         or value % 1
     ):
-        raise ValueError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIDE:,}")
+        raise ValueError(f"{where}: width and height must be integers from 1 to {MAX_SIDE:,}")
     return int(value)
 
 
 def _from_fov(degrees: Any, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
-    """K from the vertical field of view."""
+    """Intrinsics from a vertical field of view in degrees."""
     if not 0 < float(degrees) < 180:
-        raise ValueError(f"a field of view of {degrees} degrees is impossible")
+        raise ValueError(f"fov {degrees}: must be between 0 and 180 degrees")
     focal = height / 2 / math.tan(math.radians(float(degrees)) / 2)
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
@@ -180,5 +180,5 @@ def _from_fov(degrees: Any, width: int, height: int) -> Float64[np.ndarray, "3 3
 def _speed(content: dict[str, Any]) -> float:
     fps = float(content.get("fps", DEFAULT_FPS))
     if not 0 < fps <= 1000:
-        raise ValueError(f"fps {fps:g} is not a number of frames per second")
+        raise ValueError(f"fps {fps:g}: must be above 0 and at most 1000")
     return fps

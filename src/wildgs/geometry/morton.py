@@ -1,4 +1,4 @@
-"""An order in which points that are near in space are near in memory."""
+"""Morton order: points that are close in space are close in memory."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MAX_BITS = 21
-"""Three numbers of so many bits fit into 64."""
+"""Three coordinates of this many bits fit into 64 bits."""
 
 
 def morton_order(points: Float[Tensor, "N 3"], *, bits: int = 10, outside: float = 0.02) -> Int[Tensor, " N"]:
-    """Indices that sort points along the Z-shaped curve of Morton (1966).
+    """Indices that sort points along the Z-order curve (Morton 1966).
 
-    The curve's cells divide a box that holds most points; what lies outside counts to the cells at its border.
-    Points of one cell keep their order.
+    The cells of the curve divide a bounding box of most points; points outside belong to the nearest cell at its
+    border. Points of one cell keep their order.
 
     Args:
-        points: World coordinates; those that are NaN come first.
+        points: World coordinates; NaN sorts first.
         bits: The box has ``2**bits`` cells per side; at most 21.
-        outside: Share of the points that lie outside the box on each side of each axis.
+        outside: Share of the points outside the box on each side of each axis.
     """
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.long, device=points.device)
@@ -33,7 +33,7 @@ def morton_order(points: Float[Tensor, "N 3"], *, bits: int = 10, outside: float
 
 
 def _spread(numbers: Int[Tensor, "..."]) -> Int[Tensor, "..."]:
-    """Two empty bits after every bit, for numbers of at most `MAX_BITS` bits."""
+    """Inserts two zero bits after every bit, for numbers of at most `MAX_BITS` bits."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

@@ -11,7 +11,7 @@ def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     """Rotation matrices of quaternions, which need not be normalised.
 
     Args:
-        quats: (w, x, y, z), gsplat's and COLMAP's order.
+        quats: Quaternions (w, x, y, z), as in gsplat and COLMAP.
     """
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
@@ -23,10 +23,9 @@ def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
 
 
 def rotations_to_quats(rotations: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 4"]:
-    """Unit quaternions (w, x, y, z), w not negative, of rotation matrices; undoes `quats_to_rotations`.
+    """Unit quaternions (w, x, y, z) with w >= 0 of rotation matrices; the inverse of `quats_to_rotations`.
 
-    Of the four ways to write a quaternion from a matrix, each takes the one that divides by the largest
-    component, so none loses precision.
+    Of the four equivalent formulas, the one that divides by the largest component is used, for precision.
     """
     m = rotations
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]

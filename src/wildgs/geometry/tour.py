@@ -1,4 +1,4 @@
-"""An order for places that have none: well spread stops, and a short way past them."""
+"""Farthest-point sampling, and a short open tour through points."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from scipy.spatial.distance import cdist
 
 
 def spread_out(features: Float64[np.ndarray, "V D"], count: int) -> list[int]:
-    """Rows far from each other, at most `count`: each next one is the farthest from those before.
+    """Farthest-point sampling: indices of at most `count` rows, each the farthest from those before.
 
-    The first is the one nearest to the median, so that a single stray row decides nothing.
+    The first is the row nearest to the median, so that no outlier decides.
     """
     chosen = [int(np.linalg.norm(features - np.median(features, axis=0), axis=1).argmin())]
     distance = np.linalg.norm(features - features[chosen[0]], axis=1)
@@ -23,7 +23,7 @@ def spread_out(features: Float64[np.ndarray, "V D"], count: int) -> list[int]:
 
 
 def open_tour(places: Float64[np.ndarray, "S D"]) -> list[int]:
-    """A short way past all places that need not close: nearest neighbours from every start, then 2-opt."""
+    """A short open tour through all places: nearest neighbours from every start, then 2-opt."""
     distance = cdist(places, places)
     tours = [_improve(_nearest_first(start, distance), distance) for start in range(len(places))]
     return min(tours, key=lambda tour: _length(tour, distance))
@@ -38,7 +38,7 @@ def _nearest_first(start: int, distance: Float64[np.ndarray, "S S"]) -> list[int
 
 
 def _improve(tour: list[int], distance: Float64[np.ndarray, "S S"]) -> list[int]:
-    """Turns parts of the way round as long as that shortens it."""
+    """2-opt: reverses segments as long as that shortens the tour."""
     best = _length(tour, distance)
     improved = True
     while improved:

@@ -1,4 +1,4 @@
-"""Camera trajectories through a scene, in its aligned frame (+z up): where a video goes."""
+"""Camera trajectories for videos, in the aligned frame of a scene (+z up)."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from wildgs.geometry.lens import Lens, Vector, focal_of, focus, forwards_of, pos
 from wildgs.geometry.tour import open_tour, spread_out
 
 FULL_CIRCLE_GAP = 75.0
-"""Degrees: an orbit closes where cameras stand all around, with no gap wider than this."""
+"""Degrees: an orbit is a full circle if no gap between the cameras is wider than this."""
 
 TOUR_STOPS = 16
-"""Photos that a training path passes by."""
+"""Number of photos that a training path passes."""
 
 
 def still(camera: Camera, frames: int, width: int, height: int) -> list[Camera]:
-    """One camera for all frames: for videos in which only the light changes.
+    """One camera for all frames: for videos in which only the appearance changes.
 
     Args:
-        camera: The camera; its focal length is kept relative to the long side.
-        frames: How many.
-        width: Of the pictures.
-        height: Of the pictures.
+        camera: The camera; its focal length is kept relative to the longer side.
+        frames: Number of frames.
+        width: Image width in pixels.
+        height: Image height in pixels.
     """
     return interpolate([camera], frames, width, height)
 
 
 def interpolate(cameras: Sequence[Camera], frames: int, width: int, height: int) -> list[Camera]:
-    """A smooth way through given cameras, at even speed, starting and ending gently.
+    """A smooth path through given cameras at constant speed, with ease-in and ease-out.
 
-    Positions and rotations follow splines (twice differentiable), the focal length its logarithm.
+    Positions and rotations follow splines (twice differentiable); focal lengths are interpolated logarithmically.
 
     Args:
-        cameras: At least one; the first and last frame show the first and last camera's view.
-        frames: How many.
-        width: Of the pictures.
-        height: Of the pictures.
+        cameras: At least one; the path starts at the first and ends at the last.
+        frames: Number of frames.
+        width: Image width in pixels.
+        height: Image height in pixels.
     """
     focal = np.log([focal_of(camera) for camera in cameras])
     kept = [cameras[0]]
@@ -68,14 +68,14 @@ def interpolate(cameras: Sequence[Camera], frames: int, width: int, height: int)
 
 
 def _distance(first: Camera, second: Camera) -> float:
-    """Way between two cameras: world units (the usual depth is 1) and radians count alike."""
+    """Distance between two cameras: translation in world units (the median depth is 1) plus rotation in radians."""
     moved = float((first.position - second.position).norm())
     turned = Rotation.from_matrix((first.viewmat[:3, :3] @ second.viewmat[:3, :3].T).double().cpu().numpy())
     return moved + float(turned.magnitude())
 
 
 def _gentle(frames: int, ramp: float = 0.15) -> Float64[np.ndarray, " F"]:
-    """Shares of a way from 0 to 1: speeding up over the first part, slowing down over the last."""
+    """Path parameter from 0 to 1 with ease-in and ease-out."""
     time = np.linspace(0, 1, frames) if frames > 1 else np.zeros(1)
     full = 1 / (1 - ramp)
     start = full * time**2 / (2 * ramp)
@@ -87,17 +87,17 @@ def _gentle(frames: int, ramp: float = 0.15) -> Float64[np.ndarray, " F"]:
 def training_path(
     cameras: Sequence[Camera], points: Float[np.ndarray, "P 3"], frames: int, width: int, height: int
 ) -> list[Camera]:
-    """A smooth walk past the places where photos were taken, looking where the photographers looked.
+    """A smooth walk past the camera positions of the photos, looking where they look.
 
-    Photo collections have no order, so a short tour through well spread photos gives one. Photos taken from far
-    away or looking elsewhere are passed over.
+    Photo collections are unordered; the order is a short tour through photos chosen by farthest-point sampling.
+    Photos from far away and photos that look elsewhere are ignored.
 
     Args:
-        cameras: Of the training photos.
+        cameras: Cameras of the training photos.
         points: Sparse points of the scene.
-        frames: How many.
-        width: Of the pictures.
-        height: Of the pictures.
+        frames: Number of frames.
+        width: Image width in pixels.
+        height: Image height in pixels.
     """
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
@@ -112,7 +112,7 @@ def training_path(
 
 
 def _usual_cameras(cameras: Sequence[Camera], target: Vector) -> list[Camera]:
-    """Cameras at a usual distance that look at the target, all of them where none do."""
+    """Cameras at a typical distance that look at the target; all cameras if there are none."""
     distance = np.linalg.norm(positions_of(cameras) - target, axis=1)
     usual = float(np.median(distance))
     chosen = []
@@ -125,7 +125,7 @@ def _usual_cameras(cameras: Sequence[Camera], target: Vector) -> list[Camera]:
 
 
 def _smooth(stops: Float64[np.ndarray, "S 3"], frames: int) -> Float64[np.ndarray, "F 3"]:
-    """A soft curve past the stops, evenly timed between them, without their corners."""
+    """A smoothed curve past the stops, uniform in time between them."""
     if len(stops) == 1:
         return np.repeat(stops, frames, axis=0)
     fine = 40 * len(stops)
@@ -137,17 +137,17 @@ def _smooth(stops: Float64[np.ndarray, "S 3"], frames: int) -> Float64[np.ndarra
 def orbit(
     cameras: Sequence[Camera], points: Float[np.ndarray, "P 3"], frames: int, width: int, height: int
 ) -> list[Camera]:
-    """Around the landmark, as far and as high as photos were taken in each direction, looking at what they show.
+    """An orbit around the landmark, at the distance and height of the photos in each direction.
 
-    A full circle where photos were taken all around. Else an arc over the side that they show (the facade), there
-    and back, so that the video can loop in both cases.
+    A full circle if there are photos from all around; otherwise an arc over the photographed side (the facade),
+    back and forth. The video loops in both cases.
 
     Args:
-        cameras: Of the training photos.
+        cameras: Cameras of the training photos.
         points: Sparse points of the scene.
-        frames: How many.
-        width: Of the pictures.
-        height: Of the pictures.
+        frames: Number of frames.
+        width: Image width in pixels.
+        height: Image height in pixels.
     """
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
@@ -166,7 +166,7 @@ def orbit(
 
 
 def _sweep(azimuths: Float64[np.ndarray, " V"], frames: int) -> Float64[np.ndarray, " F"]:
-    """Directions of an orbit's frames, degrees."""
+    """Azimuths of the frames of an orbit in degrees."""
     ordered = np.sort(azimuths)
     gaps = np.diff(np.append(ordered, ordered[0] + 360))
     after = int(gaps.argmax())
@@ -183,7 +183,7 @@ def _sweep(azimuths: Float64[np.ndarray, " V"], frames: int) -> Float64[np.ndarr
 def _nearby(
     azimuth: float, azimuths: Float64[np.ndarray, " V"], width: float = 20.0
 ) -> Float64[np.ndarray, " V"]:
-    """Weights of cameras by their direction, degrees; they add up to one, and are never all zero."""
+    """Weights of cameras by their azimuth in degrees; they sum to 1."""
     apart = (azimuths - azimuth + 180) % 360 - 180
     weights = np.exp(-0.5 * (apart / width) ** 2) + 1e-3
     return weights / weights.sum()
@@ -199,16 +199,16 @@ def spiral(
     turns: int = 2,
     radius: float = 0.12,
 ) -> list[Camera]:
-    """Small circles about the most central photo, to and fro, always looking at the landmark; it loops.
+    """Small circles around the most central photo, looking at the landmark; the video loops.
 
     Args:
-        cameras: Of the training photos.
+        cameras: Cameras of the training photos.
         points: Sparse points of the scene.
-        frames: How many.
-        width: Of the pictures.
-        height: Of the pictures.
-        turns: Circles.
-        radius: Of the circles, as a share of the distance to the landmark.
+        frames: Number of frames.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        turns: Number of circles.
+        radius: Radius of the circles relative to the distance of the landmark.
     """
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
