@@ -188,14 +188,16 @@ class _Bench:
 
         A process that ends without finishing its job leaves it open, and one of the others takes it.
         """
+        tried: set[int] = set()
         while True:
             waiting = False
             for number, job in enumerate(self.jobs):
-                if self._is_closed(job):
+                if number in tried or self._is_closed(job):
                     continue
                 with _claim(job.folder) as claimed:
                     waiting |= not claimed
                     if claimed and not self._is_closed(job):
+                        tried.add(number)
                         yield number, job
             if not waiting:
                 return
