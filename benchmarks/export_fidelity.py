@@ -21,13 +21,13 @@ import gsply
 import numpy as np
 import torch
 
-from wildgs import api
-from wildgs.cli.webpage import baked, page_looks, viewpoints_of
-from wildgs.export.formats import SplatFormat, write_splats
-from wildgs.export.page_scene import pack_scene
-from wildgs.export.splats import Splats
+import wildgs as api
+from wildgs.exporters.formats import SplatFormat, write_splats
+from wildgs.exporters.page_scene import pack_scene
+from wildgs.exporters.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
+from wildgs.library.webpage import baked, page_looks, viewpoints_of
 from wildgs.model.gaussians import NEAR
 from wildgs.rasterize import rasterize
 from wildgs.scene import View

@@ -75,6 +75,7 @@ def _measure(command: Command, count: int, side: int) -> int:
 
 
 def _train_in_memory(command: Command, count: int, side: int) -> int:
+    import numpy as np
     import torch
 
     from wildgs.engine.checkpoint import save_checkpoint
@@ -85,22 +86,21 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
     from wildgs.model.registry import create_method
     from wildgs.model.wildgs import WildGSConfig
     from wildgs.scene import Alignment, Scene, View
+    from wildgs.scene.images import Photo
+    from wildgs.scene.photo_store import MemoryPhotos
 
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=generator) - torch.tensor([0.5, 0.5, -1.0])
     colors = torch.full((count, 3), 128, dtype=torch.uint8)
-    photo = torch.full((side, side, 3), 100, dtype=torch.uint8)
+    photo = Photo(np.full((side, side, 3), 100, dtype=np.uint8))
+    photos = MemoryPhotos({f"{index}.jpg": photo for index in range(2)})
     K = torch.tensor([[0.8 * side, 0, side / 2], [0, 0.8 * side, side / 2], [0, 0, 1]])
     views = tuple(
         View(
             name=f"{index}.jpg",
             camera=Camera(torch.eye(4), K, side, side),
             split="train",
-            read_photo=lambda: photo,
-            read_mask=lambda: None,
-            read_disparity=lambda: None,
-            read_clean=lambda: None,
-            read_truth_mask=lambda: None,
+            photos=photos,
         )
         for index in range(2)
     )
@@ -127,8 +127,8 @@ def _train_on_photos(command: Command) -> None:
         root = Path(name)
         width, height = _write_scene(root, command)
         read_photo(root / "images" / "000000.jpg")
-        config = DataConfig(image_cache=command.image_cache, downscale=command.downscale, holdout=0)
-        scene = load_scene(root, config, progress=_progress)
+        config = DataConfig(downscale=command.downscale, holdout=0)
+        scene = load_scene(root, config, image_cache=command.image_cache, progress=_progress)
         print(
             f"\n{len(scene.views)} photos of {width}x{height}: peak {_peak() / 2**20:.0f} MiB after reading"
         )

@@ -13,8 +13,8 @@ import torch
 import tyro
 from PIL import Image
 
-from wildgs.cli.showcase import different_lights
 from wildgs.evaluation.metrics import to_8bit
+from wildgs.library.showcase import different_lights
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import load_run
@@ -44,7 +44,7 @@ def draw(method: Method, view: View, light: View) -> np.ndarray:
 
 def main(command: Command) -> None:
     run = load_run(command.demo / "wildgs")
-    scene = run.load_scene()
+    scene = run.read_scene()
     view = find_view(scene, command.view) if command.view else scene.test_views[0]
     lights = different_lights(scene.train_views, command.lights)
     with torch.no_grad():

@@ -187,8 +187,9 @@ def make_trainer(
     noise = 0.02 * torch.randn(n, 3, generator=generator)
     torch.manual_seed(0)
     method = create_method(name, model, scene.points[source] + noise, scene.point_colors[source])
-    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n), cuda_graphs=graphs)
+    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
     trainer = Trainer(method.to(device), scene, config, team)
+    trainer.cuda_graphs = graphs
     trainer.begin()
     trainer.step = trainer.schedule.first_stage + 1
     return trainer

@@ -28,8 +28,8 @@ import tyro
 from PIL import Image
 
 import wildgs
-from wildgs.cli.showcase import different_lights
-from wildgs.export.sheet import contact_sheet
+from wildgs.exporters.sheet import contact_sheet
+from wildgs.library.showcase import different_lights
 from wildgs.light.look import Look
 from wildgs.light.photos import encode_view
 from wildgs.scene import View

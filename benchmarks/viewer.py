@@ -113,7 +113,7 @@ def total(done: list[tuple[bool, Tally]], on: bool) -> Tally:
 
 def trainer_of(folder: Path) -> tuple[Trainer, TrainingSubject]:
     run = load_run(folder)
-    scene = run.load_scene()
+    scene = run.read_scene()
     trainer = resume_training(folder, scene)
     longer = Trainer(trainer.method, scene, replace(trainer.config, steps=LONGER * max(trainer.step, 1)))
     longer.restore(trainer.state())

@@ -1,4 +1,4 @@
-"""`python -m demo_generator`: makes the scene that ships with the package, or checks that it can be remade."""
+"""`python -m demo_generator`: renders the scene that ships with the package, or checks the one that does."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Command:
     output: Path | None = None
     """Archive to write."""
     check: Path | None = None
-    """Archive to compare with the scene as it is rendered now; exit code 1 where they differ."""
+    """Archive to compare with the scene as it is rendered now; exit code 1 if they differ."""
 
 
 def main(command: Command) -> int:

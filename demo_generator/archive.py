@@ -1,4 +1,4 @@
-"""The scene folder as the one file that ships with the package, and its comparison with a folder made anew."""
+"""Packs a scene folder into the archive that ships with the package, and compares the two."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PICTURES = {".jpg", ".png"}
 
 
 def pack(folder: Path, archive: Path) -> None:
-    """Writes all files of a folder into an archive: pictures as they are, everything else compressed."""
+    """Writes all files of a folder into an archive: pictures uncompressed, everything else deflated."""
     with zipfile.ZipFile(archive, "w") as target:
         for file in sorted(path for path in folder.rglob("*") if path.is_file()):
             entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), _DATE)
@@ -24,7 +24,7 @@ def pack(folder: Path, archive: Path) -> None:
 
 
 def share_of_differences(folder: Path, archive: Path) -> dict[str, float]:
-    """How much of each file of a folder differs from the archive's entry of the same name.
+    """Compares each file of a folder with the archive's entry of the same name.
 
     Pictures are compared by their decoded values, because encoders differ between versions of a library, and
     everything else by its bytes. A picture of another shape and a file that the archive lacks differ in full.

@@ -1,4 +1,4 @@
-"""From light to an 8-bit photo, as phones and cameras do it, each in its own way."""
+"""Camera response: from linear radiance to an 8-bit photo, different for each camera."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 @dataclass(frozen=True)
 class CameraResponse:
-    """How a camera turns light into a photo.
+    """Response of a camera.
 
     Attributes:
         exposure: Stops above (below) what the camera's meter proposes.
@@ -30,7 +30,7 @@ class CameraResponse:
 
 
 def draw_response(rng: np.random.Generator, *, dark: bool) -> CameraResponse:
-    """A response of some camera; pictures at dusk are exposed less and have more grain."""
+    """A random camera response; photos at dusk are darker and have more grain."""
     warm = rng.normal(0.0, 0.07)
     return CameraResponse(
         exposure=float(rng.uniform(-0.45, 0.45)) - 0.55 * dark,
@@ -43,7 +43,7 @@ def draw_response(rng: np.random.Generator, *, dark: bool) -> CameraResponse:
 
 
 def metered_gain(radiance: Float[np.ndarray, "H W 3"]) -> float:
-    """Gain that brings the picture to a middle brightness, weighted to the centre as a meter does."""
+    """Gain for medium brightness, centre-weighted like a light meter."""
     height, width = radiance.shape[:2]
     y, x = np.mgrid[:height, :width]
     weight = np.exp(-2.0 * ((x / width - 0.5) ** 2 + (y / height - 0.55) ** 2) / 0.3)

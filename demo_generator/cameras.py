@@ -1,4 +1,4 @@
-"""Where the demo's photographers stand."""
+"""Random viewpoints of the demo's photos."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Viewpoint:
     def project(
         self, points: Float[np.ndarray, "P 3"]
     ) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
-        """Pixels and depths (along the camera's axis) of points; pixels mean nothing where depth <= 0."""
+        """Pixels and depths (along the camera's axis) of points; pixels are undefined where depth <= 0."""
         local = (points - self.position) @ self.camera_to_world
         depth = local[:, 2]
         safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
@@ -62,7 +62,7 @@ def looking_at(
 
 
 def draw_viewpoint(share: float, long_side: int, rng: np.random.Generator) -> Viewpoint:
-    """A tourist's view of the landmark.
+    """A random view of the landmark.
 
     Args:
         share: Place along the arc about the front, 0 (far left) to 1 (far right).

@@ -1,4 +1,4 @@
-"""The light of one photo: sun and sky at some hour, evening lamps."""
+"""Lighting of one photo: sun and sky at a time of day, and street lamps."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Light:
         return 2.1 * np.exp(-_EXTINCTION * mass * 0.8) * (1.0 - self.overcast)
 
     def vector(self) -> Float[np.ndarray, " 21"]:
-        """What the kernels read."""
+        """Parameters as the kernels read them."""
         light = np.zeros(LIGHT_SIZE)
         grey = 0.62 * np.clip((self.elevation + 8.0) / 50.0, 0.12, 1.0)
         cover = grey * np.array([0.95, 1.0, 1.06])

@@ -57,7 +57,7 @@ class SyntheticConfig:
 
 @dataclass(frozen=True)
 class _Place:
-    """The landmark alone, all that stands about it, and both together."""
+    """The landmark, its surroundings, and both together."""
 
     landmark: World
     around: World
@@ -108,7 +108,7 @@ def _build_place() -> _Place:
 
 
 def _choose_view(index: int, place: _Place, config: SyntheticConfig, rng: np.random.Generator) -> Viewpoint:
-    """A place along the arc from which the landmark is well seen."""
+    """A random viewpoint along the arc from which the landmark is mostly visible."""
     share = (0.5 + index * _GOLDEN_RATIO) % 1.0
     best, best_share = None, -1.0
     for _ in range(12):

@@ -1,4 +1,4 @@
-"""Renders one view of the made-up place: linear light, depth and what is a visitor."""
+"""Renders one view: linear radiance, depth, and the mask of visitors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from demo_generator.solids import Solids, World
 
 @dataclass(frozen=True)
 class Rendered:
-    """What one view shows.
+    """Buffers of one view.
 
     Attributes:
         radiance: Linear RGB.
@@ -90,7 +90,7 @@ def _pool(samples: Float[np.ndarray, "h w c"], per_pixel: int) -> Float[np.ndarr
 
 
 def visible_share(landmark: World, around: World, view: Viewpoint) -> float:
-    """Share of the landmark inside the picture that nothing hides.
+    """Visible share of the landmark's area inside the picture.
 
     It is 0 where the landmark fills less than a sixth of the picture or comes nearer than 10 m.
     """
@@ -105,7 +105,7 @@ def visible_share(landmark: World, around: World, view: Viewpoint) -> float:
 
 
 def is_free(place: World, x: float, y: float, radius: float) -> bool:
-    """Whether a disc on the ground bears nothing."""
+    """Whether a disc on the ground is empty."""
     turns = np.linspace(0.0, 2.0 * np.pi, 9)
     points = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
     points[-1] = x, y

@@ -22,7 +22,7 @@ EPSILON = 2e-3
 
 @jit
 def first_hit(place, visitors, ox, oy, oz, dx, dy, dz, start, stack):
-    """Distance, index and whether it is a visitor (1) or the place (0) that a ray meets first."""
+    """First hit of a ray: distance, index, and whether it is a visitor (1) or the static scene (0)."""
     t, i = nearest_hit(place, ox, oy, oz, dx, dy, dz, start, FAR, stack)
     s, j = nearest_hit(visitors, ox, oy, oz, dx, dy, dz, start, t, stack)
     if j >= 0:
@@ -211,7 +211,7 @@ def render_samples(
 
 @njit(cache=True, parallel=True, fastmath={"contract", "arcp", "nsz"}, error_model="numpy")
 def depth_and_kind(place, visitors, origin, to_world, focal, center, width, height):
-    """Depth along the camera's axis at the pixels' centres (0 = sky), and what is there.
+    """Depth along the camera's axis at the pixel centres (0 = sky), and the kind of surface.
 
     That is -1 for the sky, 0 for the place, 1 for a visitor.
     """
@@ -232,7 +232,7 @@ def depth_and_kind(place, visitors, origin, to_world, focal, center, width, heig
 
 @jit
 def nearby_indirect(buffers, x, y):
-    """Mean of what is known beside a sample that has no known neighbour on its own surface."""
+    """Mean over known neighbours, for a sample without a known neighbour on its own surface."""
     r, g, b, total = 0.0, 0.0, 0.0, 1e-6
     for v in range(max(y - 1, 0), min(y + 2, buffers.shape[0])):
         for u in range(max(x - 1, 0), min(x + 2, buffers.shape[1])):
@@ -289,7 +289,7 @@ def smooth_indirect(buffers, spacing, result):
 
 @njit(cache=True)
 def heights_below(place, points, height):
-    """Height of what lies under points (x, y) at the given height."""
+    """Height of the first surface below points (x, y) at the given height."""
     result = np.empty(points.shape[0])
     stack = np.empty(STACK, dtype=np.int64)
     for k in range(points.shape[0]):

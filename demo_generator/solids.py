@@ -1,4 +1,4 @@
-"""Building blocks of a made-up place: solids with a pose, a material and a colour, in a hierarchy of boxes.
+"""Building blocks of the scene: solids with a pose, a material and a colour, in a hierarchy of boxes.
 
 Frames are z-up and in metres. A solid stands on its origin: its own z runs upwards from 0 (but an ellipsoid
 is centred).
@@ -71,7 +71,7 @@ class World:
 
 @dataclass
 class Solids:
-    """Collects solids; `frame` moves whatever is added next."""
+    """Collects solids; `frame` sets the pose of the solids added next."""
 
     frame_rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     frame_origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))

@@ -18,7 +18,7 @@ _PIXEL_STEP, _METRE_STEP = 1 / 32, 1 / 1024  # what is stored, far below the err
 
 @dataclass(frozen=True)
 class Photo:
-    """What the sparse points need to know of a photo.
+    """A photo, as needed to compute sparse points.
 
     Attributes:
         name: File name.
@@ -125,7 +125,7 @@ def _track(
     photos: list[Photo],
     rng: np.random.Generator,
 ) -> SparsePoint:
-    """The point with the errors of real matches: half a pixel in the photos, as much in space."""
+    """The point with errors like those of real matches: about half a pixel in the photos, and as much in space."""
     if len(seen_by) > _LONGEST_TRACK:
         seen_by = np.sort(rng.choice(seen_by, size=_LONGEST_TRACK, replace=False))
     exact, size = [], []

@@ -1,4 +1,4 @@
-"""What stands about the landmark: the square, a fountain, lamps, trees, houses and hills."""
+"""Surroundings of the landmark: the square, a fountain, lamps, trees, houses and hills."""
 
 from __future__ import annotations
 

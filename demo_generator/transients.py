@@ -1,4 +1,4 @@
-"""Who and what stands about while a photo is taken: people, a bus or a van, pigeons."""
+"""Transients of one photo: people, a bus or a van, pigeons."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _in_view(view: Viewpoint, distance: float, rng: np.random.Generator) -> tupl
 
 
 def _cloth(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A colour that people wear: many muted, some bright."""
+    """A random colour of clothes: mostly muted, sometimes bright."""
     if rng.uniform() < 0.35:
         return np.array([1.0, 1.0, 1.1]) * rng.choice([0.04, 0.1, 0.3, 0.7])
     saturation = rng.uniform(0.45, 0.9)

@@ -13,7 +13,7 @@ import torch
 
 import wildgs
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.scene import loading as loading
+from wildgs.scene.carried import CarriedPhotos
 
 DOCS = Path(__file__).parents[1] / "docs" / "python.md"
 
@@ -64,11 +64,9 @@ def test_light_moves_colours_and_no_geometry(scene) -> None:
 
 def test_photos_are_decoded_as_they_are_needed(trained: Path, monkeypatch) -> None:
     decoded = []
-    load = loading.PhotoFiles.load
+    decode = CarriedPhotos._decode
     monkeypatch.setattr(
-        loading.PhotoFiles,
-        "load",
-        lambda files, **options: decoded.append(files.name) or load(files, **options),
+        CarriedPhotos, "_decode", lambda photos, name: decoded.append(name) or decode(photos, name)
     )
     scene = wildgs.load(trained)
     names = [view.name for view in scene.views]
@@ -76,17 +74,6 @@ def test_photos_are_decoded_as_they_are_needed(trained: Path, monkeypatch) -> No
     scene.appearance(names[3])
     scene.views[3].read_photo()
     assert decoded == [names[3]]
-
-
-def test_lazy_and_eager_scenes_are_the_same(trained: Path) -> None:
-    run = wildgs.load(trained).run
-    eager, lazy = run.load_scene(), run.load_scene(lazy=True)
-    assert [v.name for v in eager.views] == [v.name for v in lazy.views]
-    assert [v.split for v in eager.views] == [v.split for v in lazy.views]
-    assert torch.equal(eager.points, lazy.points)
-    for one, other in zip(eager.views, lazy.views, strict=True):
-        assert torch.equal(one.camera.viewmat, other.camera.viewmat)
-        assert torch.equal(one.read_photo(), other.read_photo())
 
 
 def test_frames_follow_cameras_and_lights(scene) -> None:

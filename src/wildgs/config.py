@@ -18,24 +18,59 @@ from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.model.config import MethodName, WildGSConfig
-from wildgs.scene.config import DataConfig
+from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
 MAX_CONFIG_BYTES = 1_000_000
 
 
+_MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
+"""Entries of earlier versions' `config.yaml` that belong to `ExecutionConfig` now."""
+
+
 @dataclass(frozen=True)
-class RunConfig:
-    """Everything that decides a run's outcome.
+class ExecutionConfig:
+    """How work is executed: without influence on the outcome, so that a resumed run takes it as given.
 
     Attributes:
-        scene: The scene folder.
+        image_cache: Memory for decoded photos; photos beyond it are decoded again when their turn comes.
+        checkpoint_every: Steps between checkpoints.
+        checkpoint_minutes: Minutes between checkpoints; whichever comes first.
+        log_every: Steps between entries of metrics.jsonl and tensorboard.
+        pictures_every: Steps between pictures on tensorboard.
+        cuda_graphs: Record and replay networks as CUDA graphs, where there is CUDA.
+        threads: CPU threads of kernels and torch; by default WILDGS_NUM_THREADS, or all cores.
+    """
+
+    image_cache: str = IMAGE_CACHE
+    checkpoint_every: int = 1000
+    checkpoint_minutes: float = 10.0
+    log_every: int = 50
+    pictures_every: int = 500
+    cuda_graphs: bool = True
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses values that mean nothing."""
+        parse_bytes(self.image_cache)
+        for name in ("checkpoint_every", "checkpoint_minutes", "log_every", "pictures_every", "threads"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise UserError(f"--{name.replace('_', '-')} {value}: must be above 0")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What decides a run's outcome.
+
+    Attributes:
+        scene: The scene folder when the run was made; a place only, in which two equal configurations may differ.
         method: `wildgs`, or `3dgs` for the paper's baseline.
         data: How the scene is read.
         model: Wild-GS; without effect on `3dgs`.
         train: Training.
     """
 
-    scene: Path
+    scene: Path = field(default=Path(), compare=False)
     method: MethodName = "wildgs"
     data: DataConfig = field(default_factory=DataConfig)
     model: WildGSConfig = field(default_factory=WildGSConfig)
@@ -147,6 +182,9 @@ def read_config(path: Path) -> RunConfig:
         plain = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # a date that is none: ValueError
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
+    for part, name in _MOVED:
+        if isinstance(plain, dict) and isinstance(plain.get(part), dict):
+            plain[part].pop(name, None)
     return from_plain(RunConfig, plain, str(path))
 
 
@@ -174,9 +212,11 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 
 
 def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Paths of the entries in which two configurations differ, each with both plain values."""
+    """Paths of the entries in which two configurations differ, each with both plain values; without `scene`."""
     one, other = _flat(to_plain(first)), _flat(to_plain(second))
-    return {path: (value, other[path]) for path, value in one.items() if value != other[path]}
+    return {
+        path: (value, other[path]) for path, value in one.items() if value != other[path] and path != "scene"
+    }
 
 
 def _flat(plain: Any, path: str = "") -> dict[str, Any]:

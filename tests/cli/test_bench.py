@@ -89,14 +89,14 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from wildgs.cli import bench
+    from wildgs.library import benchmark as bench
 
     train_job = bench.train_job
 
-    def refuses_the_first(job: bench.Job, scene: Scene) -> None:
+    def refuses_the_first(job: bench.Job, scene: Scene, request: bench._Request) -> None:
         if job.method == "3dgs":
             raise MemoryError
-        train_job(job, scene)
+        train_job(job, scene, request)
 
     monkeypatch.setattr(bench, "train_job", refuses_the_first)
     variant = ("--methods", "3dgs", "--variant", "plain:method=3dgs,train.steps=1", "--seeds", 0)
@@ -137,7 +137,7 @@ def test_phototourism_as_distributed_beside_the_papers_figures(
         shutil.copy(data / "brandenburg_gate" / "brandenburg.tsv", data / name / f"{dataset}.tsv")
     output = tmp_path / "bench"
     options = ("--methods", "3dgs", "--seeds", 0, *TINY)
-    assert wildgs("bench", data, "--preset", "phototourism", "--output", output, *options) == 0
+    assert wildgs("bench", data, "--suite", "phototourism", "--output", output, *options) == 0
     rows = {(row["scene"], row["protocol"], row["method"]): row for row in table(output)}
     gate = rows["brandenburg_gate", "full", "3dgs"]
     assert (gate["paper_psnr"], gate["paper_ssim"], gate["paper_lpips"]) == ("19.63", "0.8817", "0.1378")

@@ -8,9 +8,10 @@ from typing import get_args
 
 import pytest
 
-from wildgs.cli.bench_plan import LABELS, METHODS, find_phototourism, make_jobs, method_config, parse_variant
 from wildgs.config import RunConfig, write_config
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.library.benchmark_plan import LABELS, find_phototourism, make_jobs, method_config, parse_variant
+from wildgs.library.config import METHODS
 from wildgs.model.wildgs import Ablation
 
 BASE = RunConfig(Path())
@@ -130,7 +131,7 @@ def test_preset_finds_its_scenes_in_the_papers_order(tmp_path):
 
 
 def test_preset_without_scenes_or_split_says_what_to_do(tmp_path):
-    with pytest.raises(UserError, match="none of the preset's scenes"):
+    with pytest.raises(UserError, match="none of the suite's scenes"):
         find_phototourism([tmp_path])
     (tmp_path / "sacre_coeur").mkdir()
     with (

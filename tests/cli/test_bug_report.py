@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from wildgs.cli import bug_report
-from wildgs.cli.bug_report import without_names, write_report
+from wildgs.library import bug_report
+from wildgs.library.bug_report import without_names, write_report
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_a_run_without_files_still_gives_a_report(tmp_path: Path) -> None:
 
 
 def test_the_doctor_prints_it(wildgs, tmp_path: Path, capsys, monkeypatch) -> None:
-    from wildgs.cli import doctor
+    from wildgs.library import doctor
 
     monkeypatch.setattr(doctor, "examine", lambda: [doctor.Check("Python", "works", "fine")])
     assert wildgs("doctor", "--report", "--run", tmp_path) == 0

@@ -5,9 +5,10 @@ import sys
 
 import pytest
 
-from wildgs.cli import doctor
-from wildgs.cli.doctor import Check, Command, examine, run
+from wildgs.cli.doctor import Command, run
 from wildgs.evaluation.lpips_weights import ENVIRONMENT
+from wildgs.library import doctor
+from wildgs.library.doctor import Check, examine
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs import api
+import wildgs as api
 
 
 def _names(run: Path) -> list[str]:
@@ -57,7 +57,7 @@ def test_what_is_left_out_and_its_cost_are_printed(wildgs, trained: Path, tmp_pa
     name = _names(trained)[0]
     assert wildgs("export", trained, "--format", "ply", "--appearance", name, "--output", tmp_path,
                   "--min-opacity", "0.09", "--sh-degree", "1", "--crop", "1") == 0  # fmt: skip
-    assert "dB PSNR against all of it" in capsys.readouterr().out
+    assert "dB PSNR against all of them" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

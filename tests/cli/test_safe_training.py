@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import signal
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 
-from wildgs.cli import training
-from wildgs.cli.interrupts import InterruptedTrainingError, StopOnSignal
+from wildgs.config import RunConfig, read_config
+from wildgs.engine import autosave
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
+from wildgs.engine.config import TrainConfig
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
+from wildgs.library.training import train
 from wildgs.runs import load_run, lock_run
 
 TRAIN = ("--method", "3dgs", "--steps", 24, "--checkpoint-every", 5)
@@ -148,18 +153,23 @@ def test_a_folder_that_cannot_be_written_is_said(landmark: Path, tmp_path: Path,
 
 
 def test_a_disk_that_fills_up_costs_no_checkpoint_and_no_step(
-    undisturbed: Path, landmark: Path, small_disk: Path, wildgs, capsys
+    undisturbed: Path, landmark: Path, small_disk: Path, tmp_path: Path, wildgs, monkeypatch, capsys
 ) -> None:
     """A real file system without room for the last checkpoint; then somebody makes room."""
     size = list_checkpoints(undisturbed / "checkpoints")[0].stat().st_size
     (small_disk / "filler").write_bytes(bytes(4 * 2**20 - int(1.6 * size)))
     run = small_disk / "run"
+    monkeypatch.setattr(autosave, "LAST_WAIT", 0.01)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     assert wildgs("train", landmark, "--output", run, *TRAIN) == 2
     errors = capsys.readouterr().err
     assert "step_00000024.safetensors cannot be written" in errors
     assert "then --resume" in errors.splitlines()[-1]
     kept = list_checkpoints(run / "checkpoints")
     assert 0 < load_checkpoint(kept[-1]).state["progress.step"] < 24
+    (rescued,) = tmp_path.glob("wildgs-run-*/checkpoints/step_00000024.safetensors")
+    assert str(rescued) in errors.splitlines()[-1]
+    assert load_checkpoint(rescued).fingerprint == fingerprint(undisturbed)
     assert sorted((run / "checkpoints").iterdir()) == kept  # nothing half
     (small_disk / "filler").unlink()
     assert wildgs("train", landmark, "--output", run, "--resume") == 0
@@ -244,17 +254,12 @@ def test_a_budget_that_cannot_fit_is_refused(
     assert wildgs("train", landmark, "--output", tmp_path / "b", *TRAIN, "--max-gaussians", 0) == 2
 
 
-def test_an_interrupted_demo_goes_on(landmark: Path, tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from wildgs.config import RunConfig, read_config
-    from wildgs.engine.trainer import TrainConfig
-    from wildgs.scene import load_scene
-
+def test_training_that_is_called_again_goes_on_with_the_same_configuration_only(
+    landmark: Path, tmp_path: Path
+) -> None:
     config = RunConfig(landmark, "3dgs", train=TrainConfig(steps=4))
-    scene = load_scene(landmark)
-    training.train_or_go_on(tmp_path, config, scene)
-    training.train_or_go_on(tmp_path, config, scene)
+    for _ in range(2):
+        assert train(landmark, config, output=tmp_path, resume="auto").steps == 4
     assert read_config(tmp_path / "config.yaml").train.steps == 4
-    with pytest.raises(UserError, match="other settings"):
-        training.train_or_go_on(tmp_path, replace(config, train=TrainConfig(steps=5)), scene)
+    with pytest.raises(UserError, match=r"train\.steps is 4, not 5"):
+        train(landmark, replace(config, train=TrainConfig(steps=5)), output=tmp_path, resume="auto")

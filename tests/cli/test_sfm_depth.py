@@ -4,6 +4,8 @@ import pytest
 
 from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
+from wildgs.library import pipeline
+from wildgs.sfm import reconstruction
 from wildgs.sfm.report import SfmReport
 
 
@@ -45,7 +47,7 @@ def test_progress_and_report_are_printed(
         progress("undistorting", 0, 0)
         return report
 
-    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    monkeypatch.setattr(reconstruction, "reconstruct", reconstruct)
     sfm.run(sfm.Command(Path("p"), Path("s"), overwrite=True))
     printed = capsys.readouterr().out
     assert "reading photos: 3 done" in printed
@@ -66,8 +68,8 @@ def test_depth_reports_what_it_wrote(
         progress(3, 3)
         return 2, 1
 
-    monkeypatch.setattr(depth, "load_depth_anything", load)
-    monkeypatch.setattr(depth, "fill_depth_folder", fill)
+    monkeypatch.setattr(pipeline, "load_depth_anything", load)
+    monkeypatch.setattr(pipeline, "fill_depth_folder", fill)
     depth.run(depth.Command(tmp_path, model="here", device="cpu"))
     assert asked == {"source": "here", "device": "cpu", "required": True}
     assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")

@@ -18,17 +18,17 @@ TINY = (
 @pytest.fixture
 def left_open(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Viewers that were left open for people; Ctrl-C comes at once, when all work is done."""
-    from wildgs.cli import view
+    from wildgs.viewer.serving import OpenViewer
 
     opened: list[Any] = []
 
-    def stay(viewer: Any) -> None:
-        opened.append(viewer)
-        while (job := viewer.jobs.take(wait=False)) is not None:
+    def stay(page: OpenViewer) -> None:
+        opened.append(page.viewer)
+        while (job := page.viewer.jobs.take(wait=False)) is not None:
             job()
-        viewer.close()
+        page.viewer.close()
 
-    monkeypatch.setattr(view, "stay", stay)
+    monkeypatch.setattr(OpenViewer, "stay", stay)
     return opened
 
 

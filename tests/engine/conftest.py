@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.memory_views import make_view
 from wildgs.geometry.camera import Camera
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.sky import SkyConfig
@@ -62,13 +63,4 @@ def _photograph(camera: Camera, light: float) -> torch.Tensor:
 
 
 def _view(name: str, camera: Camera, split, photo: torch.Tensor, disparity: torch.Tensor) -> View:
-    return View(
-        name=name,
-        camera=camera,
-        split=split,
-        read_photo=lambda: photo,
-        read_mask=lambda: None,
-        read_disparity=lambda: disparity,
-        read_clean=lambda: None,
-        read_truth_mask=lambda: None,
-    )
+    return make_view(name, camera, split, photo, disparity=disparity)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from tests.memory_views import GonePhotos
 from wildgs.engine.autosave import Autosave, AutosaveConfig
 from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.safety import PATIENCE, TrainingDivergedError
@@ -99,10 +100,9 @@ def test_the_diagnosis_names_the_only_photo(wall_scene: Scene, monkeypatch) -> N
 
 
 def test_a_photo_that_vanishes_is_passed_over(wall_scene: Scene) -> None:
-    def gone() -> torch.Tensor:
-        raise UserError("images/2.jpg: no such file; it was readable before: put it back")
-
-    views = [replace(view, read_photo=gone) if view.name == "2.jpg" else view for view in wall_scene.views]
+    views = [
+        replace(view, photos=GonePhotos()) if view.name == "2.jpg" else view for view in wall_scene.views
+    ]
     trainer = trainer_for(replace(wall_scene, views=tuple(views)), 20)
     names: list[str] = []
     with pytest.warns(WildGSWarning, match=r"2\.jpg: no such file.*goes on without it") as caught:
@@ -113,11 +113,8 @@ def test_a_photo_that_vanishes_is_passed_over(wall_scene: Scene) -> None:
 
 
 def test_no_photo_left_is_a_users_mistake(wall_scene: Scene, monkeypatch) -> None:
-    def gone() -> torch.Tensor:
-        raise UserError("no such file")
-
     trainer = trainer_for(wall_scene, 20)
-    trainer.feed.views = tuple(replace(view, read_photo=gone) for view in trainer.views)
+    trainer.feed.views = tuple(replace(view, photos=GonePhotos()) for view in trainer.views)
     monkeypatch.setattr(trainer, "_prepare", lambda: None)
     with pytest.warns(WildGSWarning), pytest.raises(UserError, match="no photo can be read any more"):
         trainer.run()

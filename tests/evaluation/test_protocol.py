@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.memory_views import make_view
 from wildgs.errors import UserError
 from wildgs.evaluation.lpips_weights import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
@@ -64,16 +65,8 @@ def picture(seed: int) -> torch.Tensor:
 
 
 def view(name, split="test", photo=None, mask=None, clean=None, truth_mask=None) -> View:
-    return View(
-        name=name,
-        camera=camera(),
-        split=split,
-        read_photo=lambda: picture(0) if photo is None else photo,
-        read_mask=lambda: mask,
-        read_disparity=lambda: None,
-        read_clean=lambda: clean,
-        read_truth_mask=lambda: truth_mask,
-    )
+    photo = picture(0) if photo is None else photo
+    return make_view(name, camera(), split, photo, mask=mask, clean=clean, truth_mask=truth_mask)
 
 
 def scene(*views: View) -> Scene:

@@ -7,13 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.memory_views import make_view
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.vanilla import VanillaGS
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
-from wildgs.scene import Alignment, Scene, View
+from wildgs.scene import Alignment, Scene
 
 SIDE = 32
 
@@ -36,18 +37,7 @@ def wall() -> Scene:
         K = torch.tensor([[30.0, 0, SIDE / 2], [0, 30.0, SIDE / 2], [0, 0, 1]])
         camera = Camera(viewmat, K, SIDE, SIDE)
         photo = photograph(camera, 1.0 if index % 2 else 0.3)
-        views.append(
-            View(
-                name=f"{index}.jpg",
-                camera=camera,
-                split="test" if index == 7 else "train",
-                read_photo=lambda photo=photo: photo,
-                read_mask=lambda: None,
-                read_disparity=lambda: None,
-                read_clean=lambda: None,
-                read_truth_mask=lambda: None,
-            )
-        )
+        views.append(make_view(f"{index}.jpg", camera, "test" if index == 7 else "train", photo))
     colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
     return Scene(Path("wall"), tuple(views), points, colors, Alignment.identity())
 

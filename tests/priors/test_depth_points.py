@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.memory_views import make_view, with_photos
 from wildgs.geometry.camera import Camera
 from wildgs.priors.depth_points import DepthPointsConfig, depth_points, fit_disparity
 from wildgs.scene import Alignment, Scene, View
@@ -27,15 +29,9 @@ def camera(index: int) -> Camera:
 
 def view(index: int, depth: torch.Tensor, mask: torch.Tensor | None = None) -> View:
     scale, shift = 0.3 + 0.2 * index, 0.1 * index
-    return View(
-        name=f"{index}.png",
-        camera=camera(index),
-        split="train",
-        read_photo=lambda: torch.full((SIDE, SIDE, 3), 10 * index, dtype=torch.uint8),
-        read_mask=lambda: mask,
-        read_disparity=lambda: scale / depth + shift,
-        read_clean=lambda: None,
-        read_truth_mask=lambda: None,
+    photo = torch.full((SIDE, SIDE, 3), 10 * index, dtype=torch.uint8)
+    return make_view(
+        f"{index}.png", camera(index), "train", photo, mask=mask, disparity=scale / depth + shift
     )
 
 
@@ -106,14 +102,15 @@ def test_no_more_points_than_asked_for_and_the_same_ones_again() -> None:
 
 @pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, points=0)])
 def test_without_depth_priors_or_use_for_them_there_are_none(config: DepthPointsConfig) -> None:
-    views = [replace(each, read_disparity=lambda: None) if config.points else each for each in scene().views]
+    views = [with_photos(each, disparity=None) if config.points else each for each in scene().views]
     points, colors = depth_points(scene(views), config)
     assert points.shape == colors.shape == (0, 3)
 
 
 def test_disparity_that_is_noise_is_passed_over() -> None:
     noise = torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(0)) + 0.1
-    views = [replace(each, read_disparity=lambda: noise) for each in scene().views]
+    codes = (noise / noise.max() * 65535).numpy().astype(np.uint16)
+    views = [with_photos(each, disparity=codes) for each in scene().views]
     assert len(depth_points(scene(views), CONFIG)[0]) == 0
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
-from wildgs.rasterize import Rendering, blend, project, rasterize, render_uint8
+from wildgs.rasterize import Rendering, blend, project, rasterize
 
 seeds = st.integers(0, 2**31 - 1)
 
@@ -136,12 +135,3 @@ def test_several_threads_render_at_once():
         job.join()
     assert len(results) == 4
     assert all(torch.equal(picture, expected.colors) for picture in results)
-
-
-def test_8_bit_pictures_of_several_cameras():
-    inputs, camera = scene(5, 300)
-    inputs[4].requires_grad_()
-    pictures = render_uint8(*inputs, [camera, camera.resized(20, 10)], background=torch.ones(3))
-    assert [tuple(p.shape) for p in pictures] == [(35, 45, 3), (10, 20, 3)]
-    exact = rasterize(*inputs, camera, background=torch.ones(3)).colors.detach()
-    assert np.abs(pictures[0].numpy() / 255 - exact.clamp(0, 1).numpy()).max() <= 0.5 / 255 + 1e-6

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.memory_views import make_view
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.geometry.camera import Camera
@@ -42,16 +43,7 @@ def view(
     viewmat[:3, 3] = -torch.tensor(position)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     pixels = torch.full((height, width, 3), 120, dtype=torch.uint8) if photo is None else photo
-    return View(
-        name=name,
-        camera=Camera(viewmat, K, width, height),
-        split="train",
-        read_photo=lambda: pixels,
-        read_mask=lambda: mask,
-        read_disparity=lambda: disparity,
-        read_clean=lambda: None,
-        read_truth_mask=lambda: None,
-    )
+    return make_view(name, Camera(viewmat, K, width, height), "train", pixels, mask=mask, disparity=disparity)
 
 
 def scene(views: list[View], points: torch.Tensor | None = None) -> Scene:

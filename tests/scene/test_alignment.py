@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.memory_views import make_view
 from wildgs.geometry.camera import Camera
 from wildgs.scene import Alignment, Scene, View, scene_extent
 from wildgs.scene.alignment import align_world
@@ -158,8 +159,7 @@ def view(position: list[float], split: str = "train") -> View:
     viewmat = torch.eye(4)
     viewmat[:3, 3] = -torch.tensor(position)
     one = Camera(viewmat, torch.eye(3), 4, 4)
-    readers = [lambda: None] * 5
-    return View(f"{position}", one, split, *readers)
+    return make_view(f"{position}", one, split)
 
 
 def scene(*views: View, tmp: str = ".") -> Scene:

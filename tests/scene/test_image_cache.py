@@ -7,24 +7,24 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.errors import UserError
-from wildgs.scene import DataConfig, load_scene
+from wildgs.scene import load_scene
 from wildgs.scene.config import parse_bytes
-from wildgs.scene.image_cache import _WINDOW, AHEAD, CachedPictures, ImageCache, available_memory
-from wildgs.scene.images import UnreadableImageError
-from wildgs.scene.pictures import Pictures
+from wildgs.scene.image_cache import _WINDOW, AHEAD, ImageCache, available_memory
+from wildgs.scene.images import Photo
 
 SIDE = 10
 BYTES = SIDE * SIDE * 3
 
 
-def picture(value: int) -> Pictures:
-    return Pictures(torch.full((SIDE, SIDE, 3), value % 256, dtype=torch.uint8), None, None)
+def picture(value: int) -> Photo:
+    return Photo(np.full((SIDE, SIDE, 3), value % 256, dtype=np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_other_text_is_no_size(text: str) -> None:
 
 def test_a_cache_that_is_no_size_is_refused() -> None:
     with pytest.raises(UserError, match="4GB"):
-        DataConfig(image_cache="plenty")
+        parse_bytes("plenty")
 
 
 @given(st.lists(st.integers(0, 29), max_size=80), st.integers(0, 40), st.booleans())
@@ -59,7 +59,7 @@ def test_any_order_gives_the_right_photos_within_the_limit(
             for later in order[position + 1 : position + 1 + AHEAD]:
                 cache.prefetch(str(later), lambda later=later: picture(later))
         found = cache.get(str(index), lambda index=index: picture(index))
-        assert int(found.photo[0, 0, 0]) == index
+        assert int(found.pixels[0, 0, 0]) == index
         assert cache.num_bytes <= max(photos, _WINDOW) * BYTES
 
 
@@ -87,30 +87,30 @@ def test_background_threads_decode_ahead() -> None:
     cache = ImageCache(0)
     threads: list[str] = []
 
-    def load() -> Pictures:
+    def load() -> Photo:
         threads.append(threading.current_thread().name)
         return picture(3)
 
     cache.prefetch("a", load)
-    assert int(cache.get("a", load).photo[0, 0, 0]) == 3
+    assert int(cache.get("a", load).pixels[0, 0, 0]) == 3
     assert len(threads) == 1
     assert threads[0].startswith("decode")
 
 
-def test_a_photo_that_vanished_is_named(tmp_path: Path) -> None:
-    def load() -> Pictures:
-        raise UnreadableImageError("no such file")
-
-    pictures = CachedPictures(ImageCache(0), "a.jpg", tmp_path / "a.jpg", load)
-    pictures.prefetch()
+def test_a_photo_that_vanished_is_named(make_scene: Callable[..., Path]) -> None:
+    root = make_scene(3)
+    scene = load_scene(root, lazy=True, image_cache="0")
+    name = scene.views[1].name
+    (root / "images" / name).unlink()
+    scene.views[1].prefetch()
     for _ in range(2):
-        with pytest.raises(UserError, match=r"a\.jpg: no such file.*put it back"):
-            pictures.get()
+        with pytest.raises(UserError, match=rf"{name}: no such file; put the photo back"):
+            scene.views[1].read_photo()
 
 
 def test_a_scene_reads_the_same_through_the_smallest_cache(make_scene: Callable[..., Path]) -> None:
     root = make_scene(12)
-    large, small = load_scene(root), load_scene(root, DataConfig(image_cache="1kB"))
+    large, small = load_scene(root), load_scene(root, image_cache="1kB")
     for a, b in zip(large.views, small.views, strict=True):
         b.prefetch()
         assert torch.equal(a.read_photo(), b.read_photo())

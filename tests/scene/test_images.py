@@ -107,7 +107,7 @@ def test_grey_is_spread_over_the_channels(tmp_path: Path) -> None:
     Image.fromarray(grey).save(tmp_path / "a.png")
     photo = read_photo(tmp_path / "a.png")
     assert np.array_equal(photo.pixels, np.repeat(grey[..., None], 3, axis=-1))
-    assert photo.opaque is None
+    assert photo.mask is None
 
 
 def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
@@ -142,9 +142,9 @@ def test_transparent_pixels_are_black_and_ignored(tmp_path: Path) -> None:
     alpha[:, 10:20] = 1
     Image.fromarray(np.dstack([gradient(), alpha])).save(tmp_path / "a.png")
     photo = read_photo(tmp_path / "a.png")
-    assert photo.opaque is not None
-    assert (photo.opaque[:, :10] == 0).all()
-    assert (photo.opaque[:, 10:] == 255).all()  # only what shows nothing at all is ignored
+    assert photo.mask is not None
+    assert (photo.mask[:, :10] == 0).all()
+    assert (photo.mask[:, 10:] == 255).all()  # only what shows nothing at all is ignored
     assert (photo.pixels[:, :10] == 0).all()
     assert np.array_equal(photo.pixels[:, 20:], gradient()[:, 20:])
 
@@ -156,8 +156,8 @@ def test_a_transparent_palette_colour_is_alpha(tmp_path: Path) -> None:
     image.putpalette([200, 10, 10, 10, 200, 10])
     image.save(tmp_path / "a.png", transparency=0)
     photo = read_photo(tmp_path / "a.png")
-    assert photo.opaque is not None
-    assert (photo.opaque[:, :20] == 0).all()
+    assert photo.mask is not None
+    assert (photo.mask[:, :20] == 0).all()
     assert tuple(photo.pixels[0, -1]) == (10, 200, 10)
 
 

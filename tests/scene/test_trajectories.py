@@ -5,22 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
+from tests.memory_views import make_view
 from wildgs.geometry.camera import Camera
 from wildgs.scene import View
 from wildgs.scene.trajectories import usual_size
 
 
 def view(width: int, height: int) -> View:
-    return View(
-        name="photo.jpg",
-        camera=Camera(torch.eye(4), torch.eye(3), width, height),
-        split="train",
-        read_photo=lambda: torch.zeros(height, width, 3, dtype=torch.uint8),
-        read_mask=lambda: None,
-        read_disparity=lambda: None,
-        read_clean=lambda: None,
-        read_truth_mask=lambda: None,
-    )
+    return make_view("photo.jpg", Camera(torch.eye(4), torch.eye(3), width, height))
 
 
 LYING, STANDING = view(41, 30), view(31, 44)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from scipy.spatial import KDTree
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.lens import Lens
-from wildgs.scene import Alignment
+from wildgs.scene import Alignment, DataConfig, Scene, load_scene
+from wildgs.scene.carried import carry_scene, read_carried_scene
 from wildgs.sfm import feature_index as feature_index_module
 from wildgs.sfm.feature_index import FeatureIndex, load_feature_index, match_features
 from wildgs.sfm.localization import LocalizationError, LocalizedPhoto, guess_camera, localize
@@ -72,8 +74,13 @@ def corner_scene(corner, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def corner_landmarks(corner_scene: Path) -> FeatureIndex:
-    return load_feature_index(corner_scene)
+def known_corner(corner_scene: Path) -> Scene:
+    return load_scene(corner_scene, DataConfig(holdout=0), alignment=Alignment.identity())
+
+
+@pytest.fixture(scope="session")
+def corner_landmarks(known_corner: Scene) -> FeatureIndex:
+    return load_feature_index(known_corner)
 
 
 @pytest.fixture
@@ -107,7 +114,7 @@ def test_every_point_has_its_descriptor(corner_landmarks: FeatureIndex) -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 1.5])
 def test_a_new_photo_is_found(corner, corner_landmarks, save_query, scale) -> None:
-    found = localize(save_query(scale=scale), corner_landmarks, Alignment.identity(), 320)
+    found = localize(save_query(scale=scale), corner_landmarks, 320)
     assert_found(found, corner)
     assert not found.focal_from_exif
     assert max(found.photo.shape[:2]) == pytest.approx(320, abs=4)
@@ -117,7 +124,7 @@ def test_a_new_photo_is_found(corner, corner_landmarks, save_query, scale) -> No
 
 def test_what_the_camera_sees_is_what_the_photo_shows(corner, corner_landmarks, save_query) -> None:
     """Undistorted and shrunk, the photo still lies on the corner: its pixels are the texture's there."""
-    found = localize(save_query(), corner_landmarks, Alignment.identity(), 160)
+    found = localize(save_query(), corner_landmarks, 160)
     true = corner_camera(corner[1][LEFT_OUT])
     y, x = np.mgrid[20:100:8, 20:140:8]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
@@ -134,7 +141,7 @@ def test_focal_length_from_exif(corner, corner_landmarks, save_query) -> None:
     camera, known = guess_camera(file, 320, 240)
     assert known
     assert camera.params[0] / 320 == pytest.approx(FOCAL, rel=0.1)
-    found = localize(file, corner_landmarks, Alignment.identity(), 320)
+    found = localize(file, corner_landmarks, 320)
     assert found.focal_from_exif
     assert_found(found, corner)
 
@@ -155,10 +162,11 @@ def test_colmap_sees_no_byte_of_a_strangers_file(save_query, monkeypatch: pytest
     assert b"hostile" not in content
 
 
-def test_the_camera_stands_in_the_aligned_frame(corner, corner_landmarks, save_query) -> None:
+def test_the_camera_stands_in_the_aligned_frame(corner, corner_scene, save_query) -> None:
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
     alignment = Alignment(turn, torch.tensor([3.0, 0, 1], dtype=torch.float64), 0.5)
-    found = localize(save_query(), corner_landmarks, alignment, 320)
+    scene = load_scene(corner_scene, DataConfig(holdout=0), alignment=alignment)
+    found = localize(save_query(), load_feature_index(scene), 320)
     expected = alignment.apply_points(torch.from_numpy(corner[1][LEFT_OUT]))
     assert float((found.camera.position.double() - expected).norm()) < 0.05
 
@@ -177,41 +185,50 @@ def test_other_pictures_are_refused_with_the_count(corner_landmarks, tmp_path, k
     with pytest.raises(
         LocalizationError, match=r"x\.png: could not be localised \(\d+ inliers of \d+ matches"
     ):
-        localize(tmp_path / "x.png", corner_landmarks, Alignment.identity(), 320)
+        localize(tmp_path / "x.png", corner_landmarks, 320)
 
 
 def test_a_file_that_is_no_picture(corner_landmarks, tmp_path) -> None:
     (tmp_path / "x.jpg").write_text("no")
     with pytest.raises(UserError, match=r"x\.jpg"):
-        localize(tmp_path / "x.jpg", corner_landmarks, Alignment.identity(), 320)
+        localize(tmp_path / "x.jpg", corner_landmarks, 320)
 
 
-def test_landmarks_are_kept_and_made_anew_for_another_model(corner_scene, tmp_path, monkeypatch) -> None:
+def test_what_a_run_carries_is_enough(corner, known_corner, save_query, tmp_path) -> None:
+    carry_scene(tmp_path / "run", known_corner)
+    carried = read_carried_scene(tmp_path / "run")
+    assert carried is not None
+    assert_found(localize(save_query(), load_feature_index(carried), 320), corner)
+
+
+def test_landmarks_are_kept_and_made_anew_for_another_model(known_corner, tmp_path, monkeypatch) -> None:
     cache = tmp_path / "landmarks.safetensors"
-    first = load_feature_index(corner_scene, cache)
+    first = load_feature_index(known_corner, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(feature_index_module, "_find_landmarks", lambda *_: pytest.fail("found anew"))
-        second = load_feature_index(corner_scene, cache)
+        patch.setattr(feature_index_module, "_index_features", lambda *_: pytest.fail("found anew"))
+        second = load_feature_index(known_corner, cache)
     assert np.array_equal(first.descriptors, second.descriptors)
     assert np.array_equal(first.points, second.points)
-    monkeypatch.setattr(feature_index_module, "_digest", lambda _: "another model")
     monkeypatch.setattr(
         feature_index_module,
-        "_find_landmarks",
+        "_index_features",
         lambda *_: FeatureIndex(*(x[:5] for x in vars(first).values())),
     )
-    assert len(load_feature_index(corner_scene, cache).points) == 5
+    other = replace(known_corner, points=known_corner.points + 1)
+    assert len(load_feature_index(other, cache).points) == 5
 
 
-def test_a_folder_that_cannot_be_written_to_is_no_fault(corner_scene, monkeypatch, corner_landmarks) -> None:
-    monkeypatch.setattr(feature_index_module, "_find_landmarks", lambda *_: corner_landmarks)
-    assert len(load_feature_index(corner_scene, Path("/proc/none/landmarks.safetensors")).points)
+def test_a_folder_that_cannot_be_written_to_is_no_fault(known_corner, monkeypatch, corner_landmarks) -> None:
+    monkeypatch.setattr(feature_index_module, "_index_features", lambda *_: corner_landmarks)
+    assert len(load_feature_index(known_corner, Path("/proc/none/landmarks.safetensors")).points)
 
 
-def test_a_model_without_observations_is_said(make_scene, corner_scene) -> None:
-    root = make_scene(3)  # all its observations lie at one corner of blank photos
-    with pytest.raises(UserError, match=r"cannot be\s+localised"):
-        load_feature_index(root)
+def test_a_model_without_observations_is_said(make_scene) -> None:
+    scene = load_scene(make_scene(3))  # its photos show nothing that could be found again
+    with pytest.raises(UserError, match=r"cannot be localised"):
+        load_feature_index(scene)
+    with pytest.raises(UserError, match=r"cannot be localised"):
+        load_feature_index(replace(scene, observations=scene.observations[:0]))
 
 
 def test_the_ratio_test_looks_at_other_points_only() -> None:

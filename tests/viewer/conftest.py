@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 import torch
 
+from tests.memory_views import make_view
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import WildGSWarning
 from wildgs.geometry.camera import Camera
@@ -38,16 +39,7 @@ EVIL = '<img src=x onerror="document.title=1">"\'&.jpg'
 
 
 def _view(name: str, camera: Camera, split, photo: torch.Tensor) -> View:
-    return View(
-        name=name,
-        camera=camera,
-        split=split,
-        read_photo=lambda: photo,
-        read_mask=lambda: None,
-        read_disparity=lambda: None,
-        read_clean=lambda: None,
-        read_truth_mask=lambda: None,
-    )
+    return make_view(name, camera, split, photo)
 
 
 @pytest.fixture(scope="session")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
+from tests.memory_views import make_view
 from wildgs.engine.trainer import Trainer
 from wildgs.viewer.comparison import HIDDEN_TINT, LONG_SIDE, compare, tint_hidden
 from wildgs.viewer.subject import Subject
@@ -28,7 +27,7 @@ def test_large_photos_are_shown_small(subject: Subject) -> None:
     view = subject.views[1]
     large = view.read_photo().repeat_interleave(40, 0).repeat_interleave(50, 1)
     camera = view.camera.resized(1600, 1280)
-    seen = compare(subject, replace(view, camera=camera, read_photo=lambda: large), subject.look(view.name))
+    seen = compare(subject, make_view(view.name, camera, photo=large), subject.look(view.name))
     assert seen.photo.shape == seen.render.shape == (384, LONG_SIDE, 3)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
 import os
 import sys
 import warnings
+from types import ModuleType
+from typing import Any
 
 from wildgs import processes
 from wildgs.errors import ReportedError, UserError, WildGSWarning
@@ -29,30 +32,21 @@ VERBS = {
 }
 DISTRIBUTED = ("train", "bench")
 """Verbs that torchrun may start on several processes."""
+HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 USER_ERROR = 2
-logging.getLogger("wildgs").addHandler(logging.NullHandler())  # or Python prints what is logged a second time
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-"""As a shell says it of `wildgs ... | head`, whose reader had enough."""
+"""As a shell reports `wildgs ... | head`, whose reader had enough."""
+
+logger = logging.getLogger("wildgs")
+logger.addHandler(logging.NullHandler())  # or Python prints what is logged a second time
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 or 143 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_usage())
-        return
-    if arguments[0] == "--version":
-        print(f"wildgs {__version__}")
-        return
-    verb, *rest = arguments
-    if verb not in VERBS:
-        _fail(f"there is no verb {verb!r}; `wildgs --help` lists them")
     try:
-        if processes.world_size() > 1 and verb not in DISTRIBUTED:
-            raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
-        with processes.library_environment():
-            _run(verb, rest)
+        _dispatch(arguments)
     except ReportedError:
         sys.exit(USER_ERROR)
     except UserError as error:
@@ -63,8 +57,73 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(BROKEN_PIPE)
     except KeyboardInterrupt as interrupt:
         if not processes.rank():
-            print(str(interrupt) or "interrupted", file=sys.stderr)
+            _say(str(interrupt) or "interrupted")
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
+    finally:
+        _drop_what_cannot_be_shown()
+
+
+def _dispatch(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in (*HELP, HELP_ALL):
+        print(_usage())
+        return
+    if arguments[0] == "--version":
+        print(f"wildgs {__version__}")
+        return
+    verb, *rest = arguments
+    if verb not in VERBS:
+        raise UserError(f"there is no verb {verb!r}; `wildgs --help` lists them")
+    if processes.world_size() > 1 and verb not in DISTRIBUTED:
+        raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
+    with processes.library_environment():
+        _run(verb, rest)
+
+
+def _run(verb: str, arguments: list[str]) -> None:
+    import tyro
+
+    module = importlib.import_module(f"wildgs.cli.{verb}")
+    # A preset, or the run to resume, among the arguments sets the defaults of the other options.
+    kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
+    description = module.Command.__doc__
+    if HELP_ALL in arguments:
+        tyro.cli(kind, prog=f"wildgs {verb}", args=["--help"], description=description)
+    if any(option in arguments for option in HELP):
+        _help(verb, module, kind)
+    command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=description)
+    from wildgs.cli.screen import Lines
+
+    lines, level = Lines(), logger.level
+    logger.addHandler(lines)
+    logger.setLevel(min(logging.INFO, level or logging.INFO))
+    showwarning = warnings.showwarning
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            warnings.simplefilter("always", WildGSWarning)
+            module.run(command)
+    finally:
+        warnings.showwarning = showwarning
+        logger.removeHandler(lines)
+        logger.setLevel(level)
+
+
+def _help(verb: str, module: ModuleType, kind: type) -> None:
+    """Prints the options that matter, and where the others are; ends the process."""
+    import tyro
+
+    from wildgs.cli.options import count_options, with_only
+
+    shown = getattr(module, "SHOWN", None)
+    brief = kind if shown is None else with_only(kind, shown)
+    try:
+        tyro.cli(brief, prog=f"wildgs {verb}", args=["--help"], description=module.Command.__doc__)
+    finally:
+        if shown is not None:
+            print(
+                f"`wildgs {verb} {HELP_ALL}` shows all {count_options(kind)} options; a run's config.yaml holds "
+                "their values."
+            )
 
 
 def _reader_has_left() -> bool:
@@ -72,35 +131,43 @@ def _reader_has_left() -> bool:
     try:
         print(flush=True)  # what failed before is no longer in the buffer
     except BrokenPipeError:
-        # Python flushes once more on its way out, and would complain then.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return True
     return False
 
 
-def _run(verb: str, arguments: list[str]) -> None:
-    import tyro
+def _drop_what_cannot_be_shown() -> None:
+    """Python flushes once more on its way out, and would end a finished work with an error there."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            _silence(stream)
 
-    warnings.showwarning = _show_warning
-    warnings.simplefilter("always", WildGSWarning)
-    module = importlib.import_module(f"wildgs.cli.{verb}")
-    # What a preset among the arguments sets is the default of the other options.
-    kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
-    command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=module.Command.__doc__)
-    module.run(command)
+
+def _silence(stream: Any) -> None:
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     """One line on stderr; other libraries' warnings are not the user's business."""
     if issubclass(category, WildGSWarning):
         line = " ".join(str(message).split())
-        logging.getLogger("wildgs").warning(line)
-        print(f"{_speaker()}warning: {line}", file=sys.stderr)
+        logger.warning(line)
+        _say(f"{_speaker()}warning: {line}")
 
 
 def _fail(message: str) -> None:
-    print(f"{_speaker()}error: {message}", file=sys.stderr)
+    _say(f"{_speaker()}error: {message}")
     sys.exit(USER_ERROR)
+
+
+def _say(line: str) -> None:
+    """Prints to stderr, which may be gone."""
+    from wildgs.cli.screen import ERR
+
+    print(line, file=ERR, flush=True)  # pyright: ignore[reportArgumentType]
 
 
 def _speaker() -> str:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
-from wildgs.api import load
-from wildgs.cli.lights import MixOptions, find_looks
-from wildgs.cli.progress import console
-from wildgs.errors import UserError
-from wildgs.light.saved import save_look
+from wildgs.cli.options import Mix
+from wildgs.cli.screen import console, print_notes, progress_shown
+from wildgs.library.config import MixOptions
 
 
 @dataclass(frozen=True)
@@ -30,16 +27,16 @@ class Command:
     """Photo of the scene by name, file of a new photo or any picture, or neutral; several with --weights."""
     output: Path
     """File to write, ending in .safetensors."""
-    mix: Annotated[MixOptions, tyro.conf.arg(name="")] = field(default_factory=MixOptions)
+    mix: Mix = field(default_factory=MixOptions)
 
 
 def run(command: Command) -> None:
     """Finds the look and saves it."""
-    scene = load(command.run)
-    looks = find_looks(scene, command.mix, command.photo)
-    if len(looks) != 1:
-        raise UserError(
-            f"{len(looks)} appearances do not go into one file; give one, or mix them by --weights"
+    import wildgs
+
+    with progress_shown() as screen:
+        saved = wildgs.appearance(
+            command.run, command.photo, command.output, mixing=command.mix, progress=screen
         )
-    file = save_look(looks[0], command.output)
-    console.print(f"{looks[0].name} -> {file} ({file.stat().st_size / 1e6:.1f} MB)")
+    print_notes([saved.look])
+    console.print(f"{saved.look.name} -> {saved.file} ({saved.file.stat().st_size / 1e6:.1f} MB)")

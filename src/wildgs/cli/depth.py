@@ -8,9 +8,8 @@ from typing import Literal
 
 import tyro
 
-from wildgs.cli.progress import console, counting
-from wildgs.errors import UserError
-from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
+from wildgs.cli.screen import console, progress_shown
+from wildgs.priors.config import DEPTH_ANYTHING
 
 
 @dataclass(frozen=True)
@@ -27,20 +26,21 @@ class Command:
     model: str = DEPTH_ANYTHING
     """Folder of the network in the hub's layout, or its name on the hub."""
     overwrite: bool = False
-    """Estimate anew what is already there."""
+    """Estimate again what is already there."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the network runs."""
 
 
 def run(command: Command) -> None:
     """Fills the scene's depth folder."""
-    if not command.scene.is_dir():
-        raise UserError(f"{command.scene}: no such folder; give the folder of a COLMAP scene")
-    device = None if command.device == "auto" else command.device
-    estimator = load_depth_anything(command.model, device=device, required=True)
-    assert estimator is not None  # `required` raises otherwise
-    with counting("estimating depth") as progress:
-        written, kept = fill_depth_folder(
-            command.scene, estimator, overwrite=command.overwrite, progress=progress
+    import wildgs
+
+    with progress_shown() as screen:
+        done = wildgs.estimate_depth(
+            command.scene,
+            model=command.model,
+            overwrite=command.overwrite,
+            device=None if command.device == "auto" else command.device,
+            progress=screen,
         )
-    console.print(f"{command.scene / 'depth'}: {written} written, {kept} there before")
+    console.print(f"{done.folder}: {done.written} written, {done.kept} there before")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from wildgs.cli.progress import console, stages
-from wildgs.sfm.reconstruction import SfmConfig, SfmReport, reconstruct
+from wildgs.cli.screen import console, progress_shown
+from wildgs.sfm.config import SfmConfig
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,12 @@ class Command:
 
 def run(command: Command) -> None:
     """Reconstructs and prints the report."""
-    report = reconstruct_with_progress(
-        command.photos, command.output, command.sfm, overwrite=command.overwrite
-    )
-    print_report(report)
-    console.print(f"scene in {command.output}", markup=False)
+    import wildgs
 
-
-def reconstruct_with_progress(
-    photos: Path, output: Path, config: SfmConfig, *, overwrite: bool = False
-) -> SfmReport:
-    """`reconstruct` with a bar, or a line, for each of its steps."""
-    with stages() as show:
-        return reconstruct(photos, output, config, overwrite=overwrite, progress=show)
-
-
-def print_report(report: SfmReport) -> None:
-    """Prints how many photos were registered, and why the others were not."""
+    with progress_shown() as screen:
+        report = wildgs.reconstruct(
+            command.photos, command.output, command.sfm, overwrite=command.overwrite, progress=screen
+        )
     for line in report.lines():
-        console.print(line, markup=False)
+        console.print(line)
+    console.print(f"scene in {command.output}")

@@ -3,33 +3,45 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from contextlib import ExitStack
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from wildgs.cli.progress import console
-from wildgs.cli.training import Window, plan_memory, read_scene, train_within_memory, with_budget
-from wildgs.config import RunConfig, read_config
-from wildgs.engine.autosave import AutosaveConfig
-from wildgs.engine.distributed import join
-from wildgs.engine.team import Team
-from wildgs.engine.trainer import TrainConfig
-from wildgs.model.registry import MethodName
-from wildgs.model.wildgs import WildGSConfig
-from wildgs.presets import PRESET_NAMES, PresetName, with_preset
-from wildgs.runs import (
-    CONFIG_FILE,
-    lock_run,
-    refuse_trained,
+from wildgs.cli.options import UNNAMED, option_name
+from wildgs.cli.screen import console, progress_shown
+from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config, with_entries
+from wildgs.engine.config import TrainConfig
+from wildgs.errors import UserError
+from wildgs.model.config import MethodName, WildGSConfig
+from wildgs.presets import PRESET_NAMES, PRESETS, PresetName, with_preset
+from wildgs.scene.config import DataConfig
+from wildgs.viewer.config import ServerConfig
+
+if TYPE_CHECKING:
+    from wildgs.viewer.serving import TrainingWindow
+
+CONFIG_FILE = "config.yaml"
+BUDGET = "train.density.max_gaussians"
+SHOWN = (
+    "method",
+    "preset",
+    "resume",
+    "max_gaussians",
+    "data.downscale",
+    "train.steps",
+    "train.seed",
+    "model.without",
+    "execution.image_cache",
+    "view",
 )
-from wildgs.scene import DataConfig
-from wildgs.viewer.server import ServerConfig, import_viser
+"""Options in the short help."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Command:
     """Trains Wild-GS (or its baseline 3dgs) on a COLMAP scene.
 
@@ -37,83 +49,106 @@ class Command:
     """
 
     scene: tyro.conf.Positional[Path]
-    """Scene folder: images/ and sparse/0/ (see docs/scene.md)."""
+    """Scene folder: images/ and sparse/0/ (see docs/scene.md); with --resume, where it lies now."""
     output: Path
     """Run folder to write."""
     method: MethodName = "wildgs"
     """wildgs, or 3dgs for plain 3D Gaussian Splatting on the same engine."""
     preset: PresetName = "default"
-    """default: the best measured; paper: nothing that the paper does not have; fast: half the steps and a lighter
-    2D Parsing. Other options change what the preset sets."""
+    """default: best measured results; paper: nothing that the paper does not have; fast: half the steps and a
+    lighter 2D Parsing. Options on the command line override the preset."""
     resume: bool = False
-    """Go on from the run's newest checkpoint, with the configuration it began with."""
+    """Resume from the newest checkpoint, with the configuration of the run. Only options of execution and
+    --max-gaussians may change."""
     max_gaussians: int | None = None
-    """Most Gaussians; by default what `--density.max-gaussians` says, or less where memory is short."""
-    data: Annotated[DataConfig, tyro.conf.arg(name="")] = field(default_factory=DataConfig)
-    model: Annotated[WildGSConfig, tyro.conf.arg(name="")] = field(default_factory=WildGSConfig)
-    train: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
-    autosave: Annotated[AutosaveConfig, tyro.conf.arg(name="")] = field(default_factory=AutosaveConfig)
+    """Upper bound on the number of Gaussians. By default --density.max-gaussians, or less where memory is short."""
+    data: Annotated[DataConfig, UNNAMED] = field(default_factory=DataConfig)
+    model: Annotated[WildGSConfig, UNNAMED] = field(default_factory=WildGSConfig)
+    train: Annotated[TrainConfig, UNNAMED] = field(default_factory=TrainConfig)
+    execution: Annotated[ExecutionConfig, UNNAMED] = field(default_factory=ExecutionConfig)
     view: bool = False
-    """Show training in the browser, and stay there when it is done. Takes at most 5% of the time."""
+    """Show training in the browser and keep the viewer open afterwards. Takes at most 5% of the time."""
     server: ServerConfig = field(default_factory=ServerConfig)
 
 
 def command_for(arguments: list[str]) -> type[Command]:
-    """The command with what the preset among the arguments sets as its options' defaults."""
+    """The command with the stored run's configuration, or the preset among the arguments, as its defaults."""
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     finder.add_argument("--preset", choices=PRESET_NAMES, default="default")
+    finder.add_argument("--output", type=Path)
+    finder.add_argument("--resume", action="store_true")
     try:
-        name: PresetName = finder.parse_known_args(arguments)[0].preset
+        found = finder.parse_known_args(arguments)[0]
     except argparse.ArgumentError:
-        return Command  # tyro tells what is wrong
-    config = with_preset(RunConfig(Path()), name)
-    unnamed = tyro.conf.arg(name="")
-    fields = [
-        ("data", Annotated[DataConfig, unnamed], field(default=config.data)),
-        ("model", Annotated[WildGSConfig, unnamed], field(default=config.model)),
-        ("train", Annotated[TrainConfig, unnamed], field(default=config.train)),
-    ]
-    return make_dataclass("Command", fields, bases=(Command,), frozen=True)
+        return Command  # tyro reports what is wrong
+    config, fields = RunConfig(), []
+    if found.resume and found.output is not None:
+        with contextlib.suppress(UserError):  # reported when the run is opened
+            config = read_config(found.output / CONFIG_FILE)
+            fields.append(("scene", tyro.conf.Positional[Path], field(default=config.scene)))
+            fields.append(("method", MethodName, field(default=config.method)))
+        # The stored number of steps has been through the preset already.
+        config = with_entries(config, PRESETS[found.preset].entries, f"preset {found.preset}")
+    else:
+        config = with_preset(config, found.preset)
+    parts: list[tuple[str, Any]] = [("data", DataConfig), ("model", WildGSConfig), ("train", TrainConfig)]
+    fields += [(name, Annotated[kind, UNNAMED], field(default=getattr(config, name))) for name, kind in parts]
+    made = make_dataclass("Command", fields, bases=(Command,), frozen=True, kw_only=True)
+    made.__doc__ = Command.__doc__
+    return made
 
 
 def run(command: Command) -> None:
     """Trains, with progress on the console; one of several processes where torchrun started it."""
-    with join() as team:
-        console.quiet = not team.first
-        _run(command, team)
+    import wildgs
+    from wildgs.engine.distributed import join
 
-
-def _run(command: Command, team: Team) -> None:
     config = RunConfig(command.scene.resolve(), command.method, command.data, command.model, command.train)
     if command.resume:
-        stored = team.from_first(lambda: read_config(command.output / CONFIG_FILE))
-        config = replace(stored, scene=config.scene)
-        if command.data.image_cache != DataConfig().image_cache:  # it has no influence on the result
-            config = replace(config, data=replace(config.data, image_cache=command.data.image_cache))
-    if command.max_gaussians is not None:
-        config = with_budget(config, command.max_gaussians)
-    if command.view:
-        import_viser()  # a mistake is told before photos are read
-    window: Window | None = None
-    with ExitStack() as stack:
-        team.from_first(lambda: stack.enter_context(lock_run(command.output)))
-        with team.together():
-            scene = read_scene(config)
-        if not command.resume:
-            team.from_first(lambda: refuse_trained(command.output))
-            with team.together():
-                config = plan_memory(config, scene, explicit=command.max_gaussians is not None)
-            config = with_budget(config, team.least(config.train.density.max_gaussians))
-        if command.view and team.first:
-            window = Window(scene, command.server, command.output.resolve().name)
-        train_within_memory(
-            command.output,
+        _refuse_changes(command, config)
+    with join() as team, ExitStack() as stack:
+        console.quiet = not team.first
+        window = _window(command) if command.view and team.first else None
+        screen = stack.enter_context(progress_shown())
+        wildgs.train(
+            command.scene,
             config,
-            scene,
+            output=command.output,
+            execution=command.execution,
             resume=command.resume,
-            autosave=command.autosave,
-            window=window,
+            max_gaussians=command.max_gaussians,
+            progress=screen,
+            observers=[screen.step],
+            attach=[] if window is None else [window.attach],
             team=team,
         )
-    if window is not None:
-        window.stay()
+        screen.close()
+        if window is not None:
+            console.print("the viewer stays open (Ctrl-C ends it)")
+            window.stay()
+
+
+def _refuse_changes(command: Command, config: RunConfig) -> None:
+    """Names the options by which a resumed run would become another one.
+
+    Raises:
+        UserError: There are some, or there is no run.
+    """
+    differing = differing_entries(read_config(command.output / CONFIG_FILE), config)
+    differing.pop(BUDGET, None)
+    if differing:
+        changes = ", ".join(
+            f"{option_name(path)} {new} (the run has {old})" for path, (old, new) in differing.items()
+        )
+        raise UserError(
+            f"--resume continues {command.output} with its own configuration and cannot change {changes}; leave "
+            "these options out, or train anew into another --output"
+        )
+
+
+def _window(command: Command) -> TrainingWindow:
+    from wildgs.viewer.server import import_viser
+    from wildgs.viewer.serving import TrainingWindow
+
+    import_viser()  # its absence is reported before photos are read
+    return TrainingWindow(command.server, command.output.resolve().name, announce=console.print)

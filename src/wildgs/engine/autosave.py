@@ -5,61 +5,57 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
 
 from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError, WildGSWarning
 
 RETRY_SECONDS = 60.0
-
-
-@dataclass(frozen=True)
-class AutosaveConfig:
-    """When checkpoints are written; whichever comes first. It has no influence on the result."""
-
-    checkpoint_every: int = 1000
-    """Steps between checkpoints."""
-    checkpoint_minutes: float = 10.0
-    """Minutes between checkpoints."""
-
-    def __post_init__(self) -> None:
-        """Refuses values that mean nothing."""
-        if self.checkpoint_every < 1 or not self.checkpoint_minutes > 0:
-            raise UserError("--checkpoint-every and --checkpoint-minutes must be above 0")
+LAST_TRIES, LAST_WAIT = 6, 10.0
+"""Attempts to write the last checkpoint, and seconds between them."""
 
 
 class Autosave:
     """An observer of training that saves what is worth saving.
 
-    Steps that were skipped for a loss or gradient that is no number are not: nothing was learnt in them, and
-    what made them fail may be in the parameters already.
+    Steps that were skipped for a non-finite loss or gradient are not: nothing was learnt in them, and what made
+    them fail may be in the parameters already.
     """
 
     def __init__(
-        self, save: Callable[[], object], config: AutosaveConfig, step: int, *, least_seconds: float = 0.0
+        self,
+        save: Callable[[], object],
+        *,
+        every: int = 1000,
+        minutes: float = 10.0,
+        step: int = 0,
+        rescue: Callable[[], Path] | None = None,
+        least_seconds: float = 0.0,
     ) -> None:
         """Sets up an `Autosave`.
 
         Args:
             save: Writes a checkpoint of the trainer's present state; raises `UserError` where it cannot.
-            config: When.
+            every: Steps between checkpoints.
+            minutes: Minutes between checkpoints; whichever comes first.
             step: The step of the newest checkpoint.
+            rescue: Writes the state to another place, where the last checkpoint cannot be written to its own.
             least_seconds: Time between two checkpoints, however many steps it is.
         """
-        self._save = save
-        self.config = config
+        self._save, self._rescue = save, rescue
+        self.every, self.minutes = every, minutes
         self.saved_step = step
         self._due = self._next_time()
         self._least_seconds = least_seconds
         self._saved_at = float("-inf")
 
     def _next_time(self) -> float:
-        return time.monotonic() + 60 * self.config.checkpoint_minutes
+        return time.monotonic() + 60 * self.minutes
 
     def __call__(self, report: StepReport) -> None:
         """Saves if it is time to; where that fails, warns and tries again a minute later."""
         rested = time.monotonic() - self._saved_at >= self._least_seconds
-        on_step = rested and report.falls_on(self.config.checkpoint_every)
+        on_step = rested and report.falls_on(self.every)
         if report.skipped is not None or not (on_step or time.monotonic() >= self._due):
             return
         try:
@@ -79,3 +75,36 @@ class Autosave:
             self.saved_step = step
             self._saved_at = time.monotonic()
             self._due = self._next_time()
+
+    def save_last(self, step: int, *, hurry: bool = False) -> None:
+        """Saves the last step: tries for a minute, then writes the state to another place.
+
+        Args:
+            step: Its number.
+            hurry: Try once only, since the process has been asked to end.
+
+        Raises:
+            UserError: It could not be written to the run folder; the message says where the state is.
+        """
+        left = 0 if hurry else LAST_TRIES - 1
+        while True:
+            try:
+                return self.save(step)
+            except UserError as error:
+                failure = error
+            if not left:
+                break
+            wait = f"{left * LAST_WAIT:.0f} s"
+            warnings.warn(f"{failure} (trying again for {wait})", WildGSWarning, stacklevel=2)
+            time.sleep(LAST_WAIT)
+            left -= 1
+        if self._rescue is None:
+            raise failure
+        try:
+            place = self._rescue()
+        except UserError:
+            raise failure from None
+        raise UserError(
+            f"{failure}; the state of step {step} was saved as {place} instead: free disk space, move it into the "
+            "run's checkpoints folder, then --resume"
+        ) from failure

@@ -129,6 +129,16 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise UserError(f"{path} cannot be read ({reason}); {_NOT_DAMAGED}") from error
 
 
+def load_header(path: Path) -> dict[str, Any]:
+    """The header of a checkpoint, without its tensors and without comparing the checksum; empty if unreadable."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("wildgs", "{}"))
+    except (OSError, SafetensorError, ValueError, RecursionError):
+        return {}
+    return header if isinstance(header, dict) else {}
+
+
 _NOT_DAMAGED = "the file stays as it is: free memory or fix permissions, then try again"
 
 

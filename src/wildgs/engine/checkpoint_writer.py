@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from wildgs.engine.checkpoint import save_checkpoint
+from wildgs.errors import UserError
 
 
 class CheckpointWriter:
@@ -31,7 +32,7 @@ class CheckpointWriter:
         Raises:
             UserError: This checkpoint, or in the background the one before it, could not be written.
         """
-        if self._thread is None:
+        if self._thread is None or not self.background:
             save_checkpoint(folder, step, state, header)
             return
         self.wait()
@@ -46,6 +47,15 @@ class CheckpointWriter:
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
+
+    def finish(self) -> bool:
+        """Waits, and writes what follows at once; whether the last checkpoint was written."""
+        self.background = False
+        try:
+            self.wait()
+        except UserError:
+            return False
+        return True
 
     def _copied(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """The state in main memory; page-locked for tensors on a GPU, and kept for the next checkpoint."""

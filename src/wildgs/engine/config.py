@@ -105,7 +105,6 @@ class TrainConfig:
         steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
         seed: Of everything random.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
-        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         objective: Loss weights.
         schedule: What happens when.
         optimizer: Learning rates.
@@ -115,7 +114,6 @@ class TrainConfig:
     steps: int = 30_000
     seed: int = 0
     precision: Precision = "auto"
-    cuda_graphs: bool = True
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

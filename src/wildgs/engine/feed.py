@@ -15,6 +15,7 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene import View
 from wildgs.scene.image_cache import AHEAD
+from wildgs.scene.scene import upload
 
 
 class PhotoFeed:
@@ -72,31 +73,17 @@ class PhotoFeed:
             return False
         return True
 
-    def photo(self, view: View) -> Float[Tensor, "H W 3"]:
-        """RGB in [0, 1]."""
-        return self._upload(view.read_photo()).float() / 255
-
-    def keep(self, view: View) -> Bool[Tensor, "H W"] | None:
-        """The user's own mask, where there is one."""
-        mask = view.read_mask()
-        return None if mask is None else self._upload(mask) > 0
+    def photo(self, view: View) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+        """The photo and which of its pixels count, see `View.load`."""
+        return view.load(self.device)
 
     def disparity(self, view: View) -> Float[Tensor, "H W"] | None:
         """The depth prior, where there is one."""
         disparity = view.read_disparity()
-        return None if disparity is None else self._upload(disparity)
+        return None if disparity is None else upload(disparity, self.device)
 
     def camera(self, view: View) -> Camera:
         """The camera, carried to the device once."""
         if view.name not in self._cameras:
             self._cameras[view.name] = view.camera.to(self.device)
         return self._cameras[view.name]
-
-    def _upload(self, tensor: Tensor) -> Tensor:
-        """A tensor in main memory, on the device.
-
-        A copy from pageable memory would wait until the device has done all that it was told before.
-        """
-        if self.device.type == "cpu":
-            return tensor
-        return tensor.pin_memory().to(self.device, non_blocking=True)

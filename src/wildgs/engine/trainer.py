@@ -76,7 +76,11 @@ Observer = Callable[[StepReport], None]
 
 
 class Trainer:
-    """Trains a method on a scene's training photos."""
+    """Trains a method on a scene's training photos.
+
+    Attributes:
+        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+    """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
         """Sets up a `Trainer`.
@@ -115,6 +119,7 @@ class Trainer:
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device)
         self.guard = StepGuard()
         self._process = ProcessSettings(self.device)
+        self.cuda_graphs = True
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -145,7 +150,7 @@ class Trainer:
                 self._prepare()
         self.team.share(self.method.state_dict().values())
         set_precision(self.method, precision)
-        switch_replays(self.method, self.config.cuda_graphs)
+        switch_replays(self.method, self.cuda_graphs)
 
     def end(self) -> None:
         """Undoes `begin`: the method in float32 without graphs, the process's settings as they were before."""
@@ -189,7 +194,7 @@ class Trainer:
         )
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
-        photo, keep = self.feed.photo(view), self.feed.keep(view)
+        photo, keep = self.feed.photo(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep)
         supervised = self.method.depth_supervised and stage.explicit
@@ -231,7 +236,7 @@ class Trainer:
         sort_rows(self.method.gaussians, self.optimizers.rows)
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
-        self.method.prepare([self.feed.photo(view) for view in chosen])
+        self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to go on exactly, as flat tensors."""

@@ -46,9 +46,11 @@ def _inside(name: str) -> PurePosixPath:
 
 
 def write_picture(file: Path, picture: UInt8[Tensor, "H W 3"]) -> None:
-    """Writes a PNG atomically."""
+    """Writes a PNG, or a JPEG where the name asks for one; an interrupted run leaves no partial picture."""
+    jpeg = file.suffix.lower() in (".jpg", ".jpeg")
+    options = {"format": "JPEG", "quality": 95} if jpeg else {"format": "PNG"}
     with written_aside(file) as aside:
-        Image.fromarray(picture.cpu().numpy()).save(aside, format="PNG")
+        Image.fromarray(picture.cpu().numpy()).save(aside, **options)
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:

@@ -141,7 +141,7 @@ def _inference(method: Method) -> Iterator[None]:
 
 def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
     """Spherical harmonics under the appearance of the view, from the part of the photo that the protocol shows."""
-    photo, camera, keep = _read_photo(view, device), view.camera.to(device), _read_keep(view, device)
+    (photo, keep), camera = view.load(device), view.camera.to(device)
     if protocol == "half":
         half = photo.shape[1] // 2
         photo, camera = photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height)
@@ -154,10 +154,6 @@ def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Note
     if not colors.isfinite().all():
         notes.add(f"{view.name}: the render contains non-finite values, scored as black")
     return to_8bit(colors)
-
-
-def _read_photo(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
-    return view.read_photo().to(device).float() / 255
 
 
 def _score_view(
@@ -238,7 +234,7 @@ def _score_masks(method: Method, scene: Scene, device: torch.device, threshold: 
         truth = view.read_truth_mask()
         if truth is None:
             continue
-        visibility = method.visibility(_read_photo(view, device))
+        visibility = method.visibility(view.load(device)[0])
         if visibility is None:
             return None
         score.add(visibility, truth > 127)

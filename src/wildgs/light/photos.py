@@ -11,6 +11,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
 from wildgs.model.method import Method
 from wildgs.scene import View, find_view, match_view
+from wildgs.scene.scene import to_unit
 
 __all__ = ["cover", "encode_photo", "encode_picture", "encode_view", "find_view", "match_view"]
 
@@ -19,16 +20,15 @@ __all__ = ["cover", "encode_photo", "encode_picture", "encode_view", "find_view"
 def encode_view(method: Method, view: View) -> Appearance:
     """The appearance of one of the scene's own photos."""
     device = method.gaussians.means.device
-    mask = view.read_mask()
-    keep = None if mask is None else mask.to(device) > 0
-    return method.encode(_unit(view.read_photo(), device), view.camera.to(device), keep)
+    photo, keep = view.load(device)
+    return method.encode(photo, view.camera.to(device), keep)
 
 
 @torch.no_grad()
 def encode_photo(method: Method, photo: UInt8[Tensor, "H W 3"], camera: Camera) -> Appearance:
     """The appearance of a photo of the place, seen by a camera in the scene's aligned frame."""
     device = method.gaussians.means.device
-    return method.encode(_unit(photo, device), camera.to(device))
+    return method.encode(to_unit(photo, device), camera.to(device))
 
 
 @torch.no_grad()
@@ -40,7 +40,7 @@ def encode_picture(method: Method, picture: UInt8[Tensor, "h w 3"], camera: Came
     """
     device = method.gaussians.means.device
     fitted = cover(picture, camera.width, camera.height)
-    return method.encode(_unit(fitted, device), camera.to(device), trust_mask=False)
+    return method.encode(to_unit(fitted, device), camera.to(device), trust_mask=False)
 
 
 def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "H W 3"]:
@@ -52,7 +52,3 @@ def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Ten
     box = (max(left, 0), max(top, 0), min(left + part[0], image.width), min(top + part[1], image.height))
     fitted = image.resize((width, height), Image.Resampling.LANCZOS, box=box)
     return torch.frombuffer(bytearray(fitted.tobytes()), dtype=torch.uint8).reshape(height, width, 3)
-
-
-def _unit(photo: UInt8[Tensor, "H W 3"], device: torch.device) -> Tensor:
-    return photo.to(device).float() / 255

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import is_file
 from wildgs.light.atlas import Atlas, make_atlas
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
 from wildgs.light.photos import encode_photo, encode_picture, encode_view
@@ -55,7 +56,7 @@ class LightSources:
         self._open_scene = open_scene
         self._landmark_cache = landmark_cache
         self._landmarks: FeatureIndex | None = None
-        self._kept: OrderedDict[tuple[str, str | None], Look] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, str | None, tuple[int, ...]], Look] = OrderedDict()
         self._atlas: Atlas | None = None
 
     @cached_property
@@ -87,7 +88,7 @@ class LightSources:
             if spec != NEUTRAL:
                 warnings.warn(f"{spec}: {ONE_LIGHT}", WildGSWarning, stacklevel=2)
             return self._own
-        key = (str(spec), like)
+        key = (str(spec), like, _stamp(Path(spec)))
         if key not in self._kept:
             self._kept[key] = self._make(self.method, str(spec), like, progress or _silent)
         self._kept.move_to_end(key)
@@ -105,9 +106,9 @@ class LightSources:
         if view is not None:
             return look_of(method, encode_view(method, view), view.name)
         file = Path(spec)
-        if not file.is_file():
+        if not is_file(file):
             raise UserError(
-                f"{spec}: is neither a photo of {self.scene.root} (names are as in its images/ folder), nor a file,"
+                f"{spec}: is neither a photo of the scene (names are as in its images/ folder), nor a file,"
                 f" nor {NEUTRAL!r}"
             )
         if like is None:
@@ -130,12 +131,12 @@ class LightSources:
         """The look of a new photo of the place."""
         if self._landmarks is None:
             self._landmarks = load_feature_index(
-                self.scene.root,
+                self.scene,
                 self._landmark_cache,
                 lambda done, total: progress("finding features of the scene's photos", done, total),
             )
         long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
-        found = localize(file, self._landmarks, self.scene.alignment, long_side)
+        found = localize(file, self._landmarks, long_side)
         appearance = encode_photo(method, found.photo, found.camera)
         return look_of(method, appearance, file.name, found.describe())
 
@@ -175,6 +176,14 @@ def read_picture(file: Path) -> UInt8[Tensor, "H W 3"]:
         return torch.from_numpy(read_photo(file).pixels)
     except UnreadableImageError as error:
         raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
+
+
+def _stamp(file: Path) -> tuple[int, ...]:
+    """What changes when a file is written again; empty where there is no file."""
+    if not is_file(file):
+        return ()
+    state = file.stat()
+    return state.st_mtime_ns, state.st_size, state.st_ino
 
 
 def _silent(*_: object) -> None:

@@ -4,6 +4,8 @@ A picture is a matrix of H rows and L = W * C numbers (channels interleaved), as
 window steps by L, the horizontal one by C. All arithmetic is in float32.
 """
 
+# pyright: reportMissingImports=false, reportIndexIssue=false
+
 from __future__ import annotations
 
 from typing import Any

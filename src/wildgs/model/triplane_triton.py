@@ -4,6 +4,8 @@ grid_sample's gradient adds 384 numbers a point (3 planes, 4 corners, 32 channel
 to an address of its own; here the channels of a cell are one line of memory, read and added to together.
 """
 
+# pyright: reportMissingImports=false, reportIndexIssue=false
+
 from __future__ import annotations
 
 from typing import Any

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
+
 
 @dataclass(frozen=True)
 class DepthPointsConfig:

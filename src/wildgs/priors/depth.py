@@ -22,12 +22,12 @@ from torch.nn.functional import interpolate
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import written_aside
 from wildgs.hub import hub_reachable
+from wildgs.priors.config import DEPTH_ANYTHING
 from wildgs.scene.colmap import read_model
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.images import UnreadableImageError, read_photo
-from wildgs.scene.pictures import depth_file
+from wildgs.scene.photo_store import depth_files
 
-DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 NETWORK_SIZE = 518
 """Side at which the network was trained; its 37 x 37 patches."""
 STORED_SIZE = 1036
@@ -166,7 +166,7 @@ def fill_depth_folder(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[int, int]:
-    """Write `depth/<stem>.png` for every photo of a scene's model.
+    """Write the depth prior of every photo of a scene's model (see `depth_files`).
 
     Args:
         root: The scene's folder.
@@ -181,9 +181,10 @@ def fill_depth_folder(
         UserError: There is no scene.
     """
     model = read_model(root)
+    targets = depth_files(root, [image.name for image in model.images])
     written = kept = 0
     for count, image in enumerate(model.images, start=1):
-        target = depth_file(root, image.name)
+        target = targets[image.name]
         if target.is_file() and not overwrite:
             kept += 1
         else:

@@ -5,7 +5,6 @@ from wildgs.rasterize.dispatch import (
     pick_backend,
     project,
     rasterize,
-    render_uint8,
     sh_to_colors,
 )
 from wildgs.rasterize.interface import BackendName, Projection, Rendering
@@ -18,6 +17,5 @@ __all__ = [
     "pick_backend",
     "project",
     "rasterize",
-    "render_uint8",
     "sh_to_colors",
 ]

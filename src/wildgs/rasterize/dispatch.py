@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
@@ -202,46 +200,3 @@ def rasterize(
     if sh_degree is not None:
         colors = sh_to_colors(means, colors, camera, degree=sh_degree, visible=projection.visible)
     return blend(projection, colors, background=background, depth=depth)
-
-
-@torch.no_grad()
-def render_uint8(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    colors: Float[Tensor, "N 3"] | Float[Tensor, "N K 3"],
-    cameras: Camera | Sequence[Camera],
-    *,
-    sh_degree: int | None = None,
-    background: Float[Tensor, "3"] | None = None,
-    backend: BackendName | None = None,
-) -> list[UInt8[Tensor, "_ _ 3"]]:
-    """Pictures for a viewer or a video: 8 bits, no depth, nothing kept for gradients.
-
-    Args:
-        means: See `rasterize`.
-        quats: See `rasterize`.
-        scales: See `rasterize`.
-        opacities: See `rasterize`.
-        colors: See `rasterize`; three channels in [0, 1].
-        cameras: One or several; their pictures may differ in size.
-        sh_degree: See `rasterize`.
-        background: See `rasterize`.
-        backend: See `project`.
-
-    Returns:
-        One picture per camera, on the tensors' device, values rounded to the nearest of 0 to 255.
-
-    Raises:
-        ValueError: Shapes, devices or number types do not fit.
-        UserError: The backend is not installed.
-    """
-    pictures = []
-    for camera in [cameras] if isinstance(cameras, Camera) else cameras:
-        rendering = rasterize(
-            means, quats, scales, opacities, colors, camera,
-            sh_degree=sh_degree, background=background, backend=backend, depth=False,
-        )  # fmt: skip
-        pictures.append(rendering.colors.mul_(255).add_(0.5).clamp_(0, 255).to(torch.uint8))
-    return pictures

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
@@ -53,12 +53,21 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A sparse model: photos with poses, sorted by name, and finite points."""
+    """A sparse model: photos with poses, sorted by name, and finite points.
+
+    Attributes:
+        images_dir: The folder of the photos.
+        images: Photos with poses.
+        points: Positions, in the model's own frame.
+        point_colors: Their colours.
+        observations: Which photo (row in `images`) triangulated which point (row in `points`).
+    """
 
     images_dir: Path
     images: tuple[ColmapImage, ...]
     points: Float[Tensor, "P 3"]
     point_colors: UInt8[Tensor, "P 3"]
+    observations: Int[Tensor, "T 2"]
 
 
 def find_model(root: Path) -> tuple[Path, Path]:
@@ -120,7 +129,19 @@ def read_model(root: Path) -> ColmapModel:
     )
     _refuse_repeated([image.name for image in images], folder)
     points, colors = records.points.xyz[finite], records.points.rgb[finite]
-    return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors))
+    observations = _observations(records.points, finite, [image.image_id for image in registered])
+    return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors), observations)
+
+
+def _observations(points: PointRecords, finite: np.ndarray, image_ids: Sequence[int]) -> Int[Tensor, "T 2"]:
+    """Rows of photos and of finite points, for every observation of both."""
+    order = np.argsort(np.array(image_ids, dtype=np.int64), kind="stable")
+    ids = np.array(image_ids, dtype=np.int64)[order]
+    found = np.searchsorted(ids, points.track_image).clip(max=len(ids) - 1)
+    usable = (ids[found] == points.track_image) & finite[points.track_point]
+    rows = np.cumsum(finite) - 1
+    pairs = np.stack([order[found[usable]], rows[points.track_point[usable]]], axis=1)
+    return torch.from_numpy(pairs.astype(np.int32))
 
 
 def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:

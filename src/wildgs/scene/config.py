@@ -17,6 +17,9 @@ _UNITS = {"": 1, "B": 1} | {
     for ending, base in (("", 1000), ("B", 1000), ("IB", 1024))
 }
 
+IMAGE_CACHE = "4GB"
+"""Memory for decoded photos unless another size is asked for."""
+
 
 @dataclass(frozen=True)
 class DataConfig:
@@ -32,8 +35,6 @@ class DataConfig:
     """Read the depth prior in depth/."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
     """Pictures with more pixels are left out unread."""
-    image_cache: str = "4GB"
-    """Memory for decoded photos; those beyond it are decoded again at their turn. No influence on the result."""
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing."""
@@ -43,7 +44,6 @@ class DataConfig:
             raise UserError(f"holdout {self.holdout}: must be 0 (all photos train) or at least 2")
         if self.max_image_pixels < 1:
             raise UserError(f"max-image-pixels {self.max_image_pixels}: must be above 0")
-        parse_bytes(self.image_cache)
 
 
 def parse_bytes(text: str) -> int:

@@ -1,4 +1,4 @@
-"""Decoded pictures within a byte limit, the rest decoded again in background threads before they are needed.
+"""Decoded photos within a byte limit, the rest decoded again in background threads before they are needed.
 
 Photos train in shuffled rounds, so a photo's next turn is about a round away: a cache that throws out what was
 used longest ago would throw out nearly everything just before its turn. Here the first photos that fit stay for
@@ -14,10 +14,8 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from wildgs.errors import UserError
 from wildgs.processes import local_world_size
-from wildgs.scene.images import UnreadableImageError
-from wildgs.scene.pictures import Pictures
+from wildgs.scene.images import Photo
 
 DECODERS = 4
 """Threads that decode photos; Pillow works without Python's lock."""
@@ -29,20 +27,20 @@ _WINDOW = AHEAD + 2
 
 
 class ImageCache:
-    """Keeps decoded pictures; safe to use from several threads.
+    """Keeps decoded photos; safe to use from several threads.
 
     Attributes:
         limit: Bytes; a few photos around the present one are kept even where they exceed it.
-        decoded: How many pictures were decoded again so far.
+        decoded: How many photos were decoded again so far.
     """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.decoded = 0
         self._lock = threading.Lock()
-        self._kept: dict[str, Pictures] = {}
-        self._recent: OrderedDict[str, Pictures] = OrderedDict()
-        self._pending: dict[str, Future[Pictures]] = {}
+        self._kept: dict[str, Photo] = {}
+        self._recent: OrderedDict[str, Photo] = OrderedDict()
+        self._pending: dict[str, Future[Photo]] = {}
         self._largest = 0
         self._kept_bytes = 0
         self._recent_bytes = 0
@@ -50,41 +48,41 @@ class ImageCache:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes of all pictures held now."""
+        """Bytes of all photos held now."""
         return self._kept_bytes + self._recent_bytes
 
-    def put(self, name: str, pictures: Pictures, *, keep: bool = True) -> None:
-        """Takes pictures in.
+    def put(self, name: str, photo: Photo, *, keep: bool = True) -> None:
+        """Takes a photo in.
 
         Args:
             name: Of the photo.
-            pictures: Decoded.
-            keep: Whether they may stay for good: photos that train do.
+            photo: Decoded.
+            keep: Whether it may stay for good, as photos that train do.
         """
-        size = pictures.num_bytes
+        size = photo.num_bytes
         with self._lock:
             if name in self._kept or name in self._recent:
                 return
             self._largest = max(self._largest, size)
             if keep and self._kept_bytes + size + _WINDOW * self._largest <= self.limit:
-                self._kept[name] = pictures
+                self._kept[name] = photo
                 self._kept_bytes += size
             else:
-                self._recent[name] = pictures
+                self._recent[name] = photo
                 self._recent_bytes += size
             while self.num_bytes > self.limit and len(self._recent) > _WINDOW:
                 _, old = self._recent.popitem(last=False)
                 self._recent_bytes -= old.num_bytes
 
-    def get(self, name: str, load: Callable[[], Pictures]) -> Pictures:
-        """Pictures, from the cache, from a background thread that is at it, or decoded now.
+    def get(self, name: str, load: Callable[[], Photo]) -> Photo:
+        """A photo, from the cache, from a background thread that is at it, or decoded now.
 
         Args:
             name: Of the photo.
             load: Decodes its files.
 
         Raises:
-            UnreadableImageError: They cannot be decoded.
+            UnreadableImageError: It cannot be decoded.
             UserError: Likewise.
         """
         with self._lock:
@@ -96,8 +94,8 @@ class ImageCache:
             pending = self._pending.get(name)
         return pending.result() if pending is not None else self._decode(name, load)
 
-    def prefetch(self, name: str, load: Callable[[], Pictures]) -> None:
-        """Starts decoding in the background, unless the pictures are here or on their way."""
+    def prefetch(self, name: str, load: Callable[[], Photo]) -> None:
+        """Starts decoding in the background, unless the photo is here or on its way."""
         with self._lock:
             if name in self._kept or name in self._recent or name in self._pending:
                 return
@@ -105,45 +103,15 @@ class ImageCache:
                 self._pool = ThreadPoolExecutor(DECODERS, thread_name_prefix="decode")
             self._pending[name] = self._pool.submit(self._decode, name, load)
 
-    def _decode(self, name: str, load: Callable[[], Pictures]) -> Pictures:
+    def _decode(self, name: str, load: Callable[[], Photo]) -> Photo:
         try:
-            pictures = load()
-            self.put(name, pictures, keep=False)
+            photo = load()
+            self.put(name, photo, keep=False)
         finally:
             with self._lock:
                 self.decoded += 1
                 self._pending.pop(name, None)
-        return pictures
-
-
-class CachedPictures:
-    """One photo's pictures, read through the cache; `View`'s readers."""
-
-    def __init__(self, cache: ImageCache, name: str, path: Path, load: Callable[[], Pictures]) -> None:
-        """Sets up a `CachedPictures`.
-
-        Args:
-            cache: Shared by the scene's photos.
-            name: Of the photo.
-            path: Its file, for messages.
-            load: Decodes it and what belongs to it.
-        """
-        self._cache, self._name, self._path, self._load = cache, name, path, load
-
-    def get(self) -> Pictures:
-        """The pictures.
-
-        Raises:
-            UserError: The files changed since the scene was read, and cannot be used any more.
-        """
-        try:
-            return self._cache.get(self._name, self._load)
-        except UnreadableImageError as error:
-            raise UserError(f"{self._path}: {error}; it was readable before: put it back") from error
-
-    def prefetch(self) -> None:
-        """Decodes in the background."""
-        self._cache.prefetch(self._name, self._load)
+        return photo
 
 
 def available_memory() -> int | None:

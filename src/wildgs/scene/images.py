@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped, UInt8, UInt16
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
+from wildgs.files import check_regular
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 
 EXIF_ORIENTATION = 0x0112
@@ -45,15 +46,23 @@ class ShapeMismatchError(UnreadableImageError):
 
 @dataclass(frozen=True)
 class Photo:
-    """A decoded photo.
+    """A decoded photo. Shared between readers: its arrays are not to be written to.
 
     Attributes:
-        pixels: Colours; black where the photo is fully transparent.
-        opaque: 255 where the photo shows something, 0 where its alpha is 0; None for a photo without alpha.
+        pixels: Colours, 8 bits; black where the photo is fully transparent.
+        mask: 0 = ignore (transparent, outside the lens's picture, or the user's own mask), 255 = use; None where
+            nothing is ignored.
+        disparity: Depth prior, 16 bits, large = near, 0 = no estimate; None where there is none.
     """
 
     pixels: UInt8[np.ndarray, "H W 3"]
-    opaque: UInt8[np.ndarray, "H W"] | None
+    mask: UInt8[np.ndarray, "H W"] | None = None
+    disparity: UInt16[np.ndarray, "H W"] | None = None
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of its arrays."""
+        return sum(array.nbytes for array in (self.pixels, self.mask, self.disparity) if array is not None)
 
 
 def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
@@ -63,6 +72,7 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
         UnreadableImageError: It is missing, no picture, or has more pixels than `max_pixels`.
     """
     try:
+        check_regular(path)
         # Pillow's own limit is a global of the process, and warns; ours is an argument.
         with _open_lock:
             previous, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
@@ -72,6 +82,11 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
                 Image.MAX_IMAGE_PIXELS = previous
     except FileNotFoundError as error:
         raise UnreadableImageError("no such file") from error
+    except UnidentifiedImageError as error:
+        raise UnreadableImageError("not a readable picture") from error
+    except OSError as error:  # no permission, a pipe or device, a name that is too long
+        reason = error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UnreadableImageError(reason) from error
     except Exception as error:  # Pillow's plugins raise nearly anything on broken headers
         raise UnreadableImageError("not a readable picture") from error
     width, height = image.size
@@ -164,7 +179,7 @@ def read_photo(
         colours, alpha = _to_rgb(_upright(image) if turn else image)
         return Photo(
             pixels=np.array(_resize(colours, size, Image.Resampling.LANCZOS)),
-            opaque=None if alpha is None else _resize_mask(alpha, size),
+            mask=None if alpha is None else _resize_mask(alpha, size),
         )
 
 
@@ -173,14 +188,16 @@ def read_mask(
 ) -> UInt8[np.ndarray, "H W"]:
     """Decode a mask: 0 where the file is black (ignored), 255 elsewhere; by majority where it is shrunk.
 
+    JPEG files, whose black is only nearly so, are cut at half brightness.
+
     Raises:
         UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
     """
     with open_image(path, max_pixels) as image:
         _check_shape(image, size)
         _load(image)
-        grey = image if _is_deep(image) else image.convert("L")
-        return _resize_mask(np.asarray(grey) != 0, size)
+        least = 128 if image.format in ("JPEG", "MPO") else 1
+        return _resize_mask(np.asarray(_to_grey(image)) >= least, size)
 
 
 def read_disparity(
@@ -196,7 +213,7 @@ def read_disparity(
     with open_image(path, max_pixels) as image:
         _check_shape(image, size)
         _load(image)
-        values = np.asarray(image if _is_deep(image) else image.convert("L")).astype(np.float32)
+        values = np.asarray(_to_grey(image)).astype(np.float32)
         values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
         if not _is_deep(image):
             values *= 257.0
@@ -217,6 +234,18 @@ def _check_shape(image: Image.Image, size: tuple[int, int]) -> None:
 
 def _times(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
+
+
+def _to_grey(image: Image.Image) -> Image.Image:
+    """One channel: as it is where it has more than 8 bits, else the luminance."""
+    if _is_deep(image):
+        return image
+    try:
+        return image.convert("L")
+    except ValueError as error:  # Pillow converts some modes (LAB) to nothing but RGB, or not at all
+        raise UnreadableImageError(
+            f"its colour mode {image.mode} is not supported; save it as grey"
+        ) from error
 
 
 def _is_deep(image: Image.Image) -> bool:

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
@@ -15,26 +14,25 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
-from wildgs.scene.config import DataConfig, parse_bytes
-from wildgs.scene.image_cache import DECODERS, CachedPictures, ImageCache, available_memory
+from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
+from wildgs.scene.image_cache import DECODERS, ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
-from wildgs.scene.pictures import PhotoFiles, Pictures
-from wildgs.scene.scene import Alignment, Scene, Split, View
+from wildgs.scene.photo_store import ScenePhotos
+from wildgs.scene.scene import Alignment, Scene, Split, View, observations_of
 from wildgs.scene.split import assign_splits
 from wildgs.scene.undistort import PixelGrid
 
 CACHE_SHARE = 0.5
 """Share of the free memory that decoded photos take at most, whatever the limit."""
 
-KEPT_PICTURES = 8
-"""Photos that a lazily read scene keeps decoded."""
-
 
 def load_scene(
     root: Path,
     config: DataConfig | None = None,
     *,
+    alignment: Alignment | None = None,
     lazy: bool = False,
+    image_cache: str = IMAGE_CACHE,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Read a COLMAP scene: cameras, points, split, photos (8 bits, within `image_cache`), masks, depth.
@@ -45,8 +43,11 @@ def load_scene(
         root: Folder with `images/` and `sparse/0/` (or `sparse/`, `dense/sparse/`), optionally a `*.tsv`
             split, `masks/`, `depth/` and `truth/`.
         config: Size, split and limits; the defaults where None.
+        alignment: From the model's frame to the scene's; None computes it from the model. Runs give their own, so
+            that their Gaussians fit whatever has become of the model.
         lazy: Decode photos only when they are asked for, and keep the last few: for tools that look at some of
             them. A photo that cannot be read is then no reason to leave its view out.
+        image_cache: Memory for decoded photos, such as 4GB; without influence on what is read.
         progress: Called with (photos read, photos in all) as photos are decoded.
 
     Returns:
@@ -58,29 +59,49 @@ def load_scene(
     """
     root, config = Path(root), config or DataConfig()
     model = read_model(root)
-    splits = assign_splits([image.name for image in model.images], root, config.holdout)
-    alignment = align_world(
-        [_unit_camera(image) for image in model.images],
-        model.points,
-        [image.median_depth for image in model.images if image.median_depth is not None],
+    names = [image.name for image in model.images]
+    splits = assign_splits(names, root, config.holdout)
+    if alignment is None:
+        alignment = align_world(
+            [_unit_camera(image) for image in model.images],
+            model.points,
+            [image.median_depth for image in model.images if image.median_depth is not None],
+        )
+    photos = ScenePhotos(
+        root,
+        model.images_dir,
+        names,
+        ImageCache(0 if lazy else _cache_limit(image_cache)),
+        use_masks=config.use_masks,
+        use_depth=config.use_depth,
+        max_pixels=config.max_image_pixels,
     )
     chosen = [image for image in model.images if image.name in splits]
-    load_view = partial(
-        _lazy_view if lazy else partial(_load_view, cache=ImageCache(_cache_limit(config))),
-        alignment=alignment,
-        images_dir=model.images_dir,
-        root=root,
-        config=config,
-    )
-    views, broken = _load_views(chosen, splits, load_view, progress)
+    views, broken = _load_views(chosen, splits, photos, alignment, config, lazy, progress)
     _report_broken(broken, views, model.images_dir)
+    _check_masks(photos, views)
     return Scene(
         root=root,
         views=tuple(views),
         points=alignment.apply_points(model.points).to(torch.float32),
         point_colors=model.point_colors,
         alignment=alignment,
+        observations=observations_of(model.observations, names, views),
     )
+
+
+def _check_masks(photos: ScenePhotos, views: Sequence[View]) -> None:
+    """Warns where there are masks, and none of them belongs to a photo."""
+    folder = photos.root / "masks"
+    if not photos.use_masks or not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if all(photos.find_mask(view.name) is None for view in views):
+        warnings.warn(
+            f"{folder}: none of its files is named after a photo, so no mask is used; "
+            f"name them as in {views[0].name}.png",
+            WildGSWarning,
+            stacklevel=3,
+        )
 
 
 def _unit_camera(image: ColmapImage) -> Camera:
@@ -91,7 +112,10 @@ def _unit_camera(image: ColmapImage) -> Camera:
 def _load_views(
     chosen: Sequence[ColmapImage],
     splits: dict[str, Split],
-    load_view: Callable[[ColmapImage, Split], View],
+    photos: ScenePhotos,
+    alignment: Alignment,
+    config: DataConfig,
+    lazy: bool,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[list[View], list[tuple[str, str]]]:
     """Views in the order of their names, and (name, reason) of the photos that cannot be read."""
@@ -100,9 +124,15 @@ def _load_views(
 
     def load(image: ColmapImage) -> View | str:
         try:
-            return load_view(image, splits[image.name])
+            grid = _pixel_grid(image, config)
+            photos.add(image.name, grid)
+            if not lazy:
+                photos.load(image.name, keep=splits[image.name] == "train")
         except UnreadableImageError as error:
             return str(error)
+        camera = alignment.apply_camera(Camera(image.viewmat, grid.K, grid.width, grid.height))
+        camera = replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float())
+        return View(image.name, camera, splits[image.name], photos)
 
     pool = ThreadPoolExecutor(DECODERS)
     try:
@@ -118,75 +148,13 @@ def _load_views(
     return views, broken
 
 
-def _cache_limit(config: DataConfig) -> int:
-    limit, available = parse_bytes(config.image_cache), available_memory()
+def _cache_limit(image_cache: str) -> int:
+    limit, available = parse_bytes(image_cache), available_memory()
     return limit if available is None else min(limit, int(CACHE_SHARE * available))
 
 
-def _load_view(
-    image: ColmapImage,
-    split: Split,
-    alignment: Alignment,
-    images_dir: Path,
-    root: Path,
-    config: DataConfig,
-    cache: ImageCache,
-) -> View:
-    camera, files = _place(image, alignment, images_dir, root, config)
-    pictures = files.load(use_mask=config.use_masks, use_depth=config.use_depth)
-    # A disparity map that is missing or broken now is not looked for, and warned of, again.
-    again = partial(files.load, use_mask=config.use_masks, use_depth=pictures.disparity is not None)
-    cached = CachedPictures(cache, image.name, files.photo, again)
-    cache.put(image.name, pictures, keep=split == "train")
-    return View(
-        name=image.name,
-        camera=camera,
-        split=split,
-        read_photo=lambda: cached.get().read_photo(),
-        read_mask=lambda: cached.get().read_mask(),
-        read_disparity=lambda: cached.get().read_disparity(),
-        read_clean=files.read_clean,
-        read_truth_mask=files.read_truth_mask,
-        prefetch=cached.prefetch,
-    )
-
-
-def _lazy_view(
-    image: ColmapImage, split: Split, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
-) -> View:
-    camera, files = _place(image, alignment, images_dir, root, config)
-    later = _LaterPictures(files, config)
-    return View(
-        name=image.name,
-        camera=camera,
-        split=split,
-        read_photo=lambda: _decode(later).read_photo(),
-        read_mask=lambda: _decode(later).read_mask(),
-        read_disparity=lambda: _decode(later).read_disparity(),
-        read_clean=files.read_clean,
-        read_truth_mask=files.read_truth_mask,
-    )
-
-
-class _LaterPictures:
-    """A photo that is not decoded yet; known to the cache by identity."""
-
-    def __init__(self, files: PhotoFiles, config: DataConfig) -> None:
-        self.files, self.config = files, config
-
-
-@lru_cache(maxsize=KEPT_PICTURES)
-def _decode(later: _LaterPictures) -> Pictures:
-    try:
-        return later.files.load(use_mask=later.config.use_masks, use_depth=later.config.use_depth)
-    except UnreadableImageError as error:
-        raise UserError(f"{later.files.photo}: {error}; mend the file or choose another photo") from error
-
-
-def _place(
-    image: ColmapImage, alignment: Alignment, images_dir: Path, root: Path, config: DataConfig
-) -> tuple[Camera, PhotoFiles]:
-    """The photo's camera in the aligned frame, and where its files are."""
+def _pixel_grid(image: ColmapImage, config: DataConfig) -> PixelGrid:
+    """From the stored photo's pixels to the view's."""
     if image.camera.is_spherical():
         raise UserError(f"{image.name}: spherical cameras ({image.camera.model_name}) are not supported")
     size = (image.camera.width, image.camera.height)
@@ -194,10 +162,7 @@ def _place(
         raise UnreadableImageError(
             f"its camera has {size[0]}x{size[1]} pixels, more than --max-image-pixels {config.max_image_pixels}"
         )
-    grid = PixelGrid.from_colmap(image.camera, config.downscale)
-    camera = alignment.apply_camera(Camera(image.viewmat, grid.K, grid.width, grid.height))
-    files = PhotoFiles(root, images_dir, image.name, grid, config.max_image_pixels)
-    return replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float()), files
+    return PixelGrid.from_colmap(image.camera, config.downscale)
 
 
 def _report_broken(broken: Sequence[tuple[str, str]], views: Sequence[View], images_dir: Path) -> None:

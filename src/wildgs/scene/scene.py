@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
+from wildgs.scene.photo_store import PhotoStore
 
 Split = Literal["train", "test"]
 
@@ -79,24 +81,79 @@ class Alignment:
 class View:
     """One photo with its camera, in the scene's aligned frame.
 
-    Pixels are read on demand through the scene's readers and kept as 8 bits.
+    Pixels are read from the store of photos when they are asked for. What is read is shared: not to be written to.
 
     Attributes:
         name: Path relative to the scene's image folder; unique within the scene.
         camera: Pinhole camera at the size at which the photo is used (after downscaling).
         split: Whether the photo trains or tests.
+        photos: Where its pixels are.
     """
 
     name: str
     camera: Camera
     split: Split
-    read_photo: Callable[[], UInt8[Tensor, "H W 3"]] = field(repr=False, compare=False)
-    read_mask: Callable[[], UInt8[Tensor, "H W"] | None] = field(repr=False, compare=False)
-    read_disparity: Callable[[], Float[Tensor, "H W"] | None] = field(repr=False, compare=False)
-    read_clean: Callable[[], UInt8[Tensor, "H W 3"] | None] = field(repr=False, compare=False)
-    read_truth_mask: Callable[[], UInt8[Tensor, "H W"] | None] = field(repr=False, compare=False)
-    prefetch: Callable[[], None] = field(default=lambda: None, repr=False, compare=False)
-    """Tells the readers that this photo's turn comes soon."""
+    photos: PhotoStore = field(repr=False, compare=False)
+
+    def read_photo(self) -> UInt8[Tensor, "H W 3"]:
+        """RGB at the camera's size.
+
+        Raises:
+            UserError: The photo cannot be read (any more).
+        """
+        return torch.from_numpy(self.photos.get(self.name).pixels)
+
+    def read_mask(self) -> UInt8[Tensor, "H W"] | None:
+        """What the user or the file excludes: 0 = ignore; None where nothing is ignored."""
+        mask = self.photos.get(self.name).mask
+        return None if mask is None else torch.from_numpy(mask)
+
+    def read_disparity(self) -> Float[Tensor, "H W"] | None:
+        """Disparity in [0, 1], large = near, unknown scale and shift; 0 = no estimate; None without depth prior."""
+        disparity = self.photos.get(self.name).disparity
+        return None if disparity is None else torch.from_numpy(disparity.astype(np.float32) / 65535.0)
+
+    def read_clean(self) -> UInt8[Tensor, "H W 3"] | None:
+        """The photo without its transients, which only evaluation may look at; None where there is none."""
+        clean = self.photos.read_clean(self.name)
+        return None if clean is None else torch.from_numpy(clean)
+
+    def read_truth_mask(self) -> UInt8[Tensor, "H W"] | None:
+        """Where the photo truly shows the static scene (255) or a transient (0); None where that is not known."""
+        mask = self.photos.read_truth_mask(self.name)
+        return None if mask is None else torch.from_numpy(mask)
+
+    def prefetch(self) -> None:
+        """Says that this photo's turn comes soon."""
+        self.photos.prefetch(self.name)
+
+    def load(self, device: torch.device) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+        """The photo as methods take it.
+
+        Args:
+            device: Where the tensors go.
+
+        Returns:
+            RGB in [0, 1], and which pixels count (False = ignore; None = all).
+        """
+        mask = self.read_mask()
+        keep = None if mask is None else upload(mask, device) > 0
+        return to_unit(self.read_photo(), device), keep
+
+
+def to_unit(pixels: UInt8[Tensor, "H W 3"], device: torch.device) -> Float[Tensor, "H W 3"]:
+    """8-bit RGB as floats in [0, 1] on a device."""
+    return upload(pixels, device).float() / 255
+
+
+def upload(tensor: Tensor, device: torch.device) -> Tensor:
+    """A tensor in main memory, on a device.
+
+    To a GPU it is copied from pinned memory: a copy from pageable memory waits for all work queued before.
+    """
+    if device.type == "cuda":
+        return tensor.pin_memory().to(device, non_blocking=True)
+    return tensor.to(device)
 
 
 @dataclass(frozen=True)
@@ -111,6 +168,7 @@ class Scene:
         points: Sparse points from SfM.
         point_colors: Their colours.
         alignment: From the input's frame to this one.
+        observations: Which view (row in `views`) triangulated which point (row in `points`).
     """
 
     root: Path
@@ -118,6 +176,7 @@ class Scene:
     points: Float[Tensor, "P 3"]
     point_colors: UInt8[Tensor, "P 3"]
     alignment: Alignment
+    observations: Int[Tensor, "T 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.int32))
 
     @property
     def train_views(self) -> tuple[View, ...]:
@@ -128,6 +187,16 @@ class Scene:
     def test_views(self) -> tuple[View, ...]:
         """The photos that are held out, in name order."""
         return tuple(v for v in self.views if v.split == "test")
+
+
+def observations_of(
+    observations: Int[Tensor, "T 2"], names: Sequence[str], views: Sequence[View]
+) -> Int[Tensor, "U 2"]:
+    """Observations by rows of `names` as observations by rows of `views`; those of other photos are left out."""
+    rows = {view.name: row for row, view in enumerate(views)}
+    row_of = torch.tensor([rows.get(name, -1) for name in names], dtype=torch.int32)
+    moved = torch.stack([row_of[observations[:, 0].long()], observations[:, 1]], dim=1)
+    return moved[moved[:, 0] >= 0]
 
 
 def scene_extent(scene: Scene) -> float:

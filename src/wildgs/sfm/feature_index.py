@@ -1,29 +1,31 @@
 """What a new photo is localised against: SIFT descriptors of a scene's triangulated points.
 
-Works for any COLMAP scene whose photos observe its points (the tracks in images and points3D): features are found
-anew in the photos, and one that lies where the model has an observation stands for that observation's point. So no
-database of the reconstruction has to be kept.
+Features are found anew in the scene's photos, and one that lies where a photo observes a point stands for that
+point. Cameras, points, their observations and the photos are all that is needed: a run carries them
+(`wildgs.scene.carried`), and no database of the reconstruction has to be kept.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Int64, Shaped, UInt8
+import torch
+from jaxtyping import Float, Float64, Int, Int64, Shaped, UInt8
+from PIL import Image
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.scene.colmap import find_model
+from wildgs.files import check_regular, written_aside
+from wildgs.scene import Scene, View
 from wildgs.sfm.mapping import quiet
 
 MAX_PHOTOS = 200
@@ -35,8 +37,6 @@ MAX_IMAGE_SIZE = 1600
 SAME_PLACE = 0.0025
 """A feature and an observation are one within this share of the photo's long side (2 pixels of 800)."""
 
-BATCH = 8
-
 Progress = Callable[[int, int], None]
 
 
@@ -47,7 +47,7 @@ class FeatureIndex:
     Attributes:
         descriptors: SIFT, as COLMAP stores it (root of L1-normalised, norm about 512).
         owners: For every descriptor, its row in `points`.
-        points: Positions in the model's own frame.
+        points: Positions in the scene's aligned frame.
     """
 
     descriptors: UInt8[np.ndarray, "D 128"]
@@ -56,126 +56,115 @@ class FeatureIndex:
 
 
 def load_feature_index(
-    root: Path, cache: Path | None = None, progress: Progress | None = None
+    scene: Scene, cache: Path | None = None, progress: Progress | None = None
 ) -> FeatureIndex:
-    """The landmarks of a scene, from the cache where it fits the scene's model.
+    """The feature index of a scene, from the cache where that is of this scene.
 
     Args:
-        root: The scene's folder.
-        cache: File that keeps them; None keeps nothing, and a folder that cannot be written to is no fault.
+        scene: Its photos, cameras and points with their observations.
+        cache: File that keeps the index; None keeps nothing, and a folder that cannot be written to is no fault.
         progress: Called with (photos looked at, photos in all).
 
     Raises:
-        UserError: The model cannot be read, or its photos observe no points.
+        UserError: The scene's photos observe no points, or cannot be read.
     """
-    folder, images_dir = find_model(root)
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises ValueError, RuntimeError, MemoryError, ... on broken files
-        raise UserError(f"{folder}: the COLMAP model cannot be read; make it anew") from error
-    state = _digest(model)
+    state = _digest(scene)
     kept = _read_cache(cache, state) if cache is not None else None
     if kept is not None:
         return kept
-    landmarks = _find_landmarks(model, images_dir, progress)
+    index = _index_features(scene, progress)
     if cache is not None:
-        _write_cache(cache, landmarks, state)
-    return landmarks
+        with contextlib.suppress(UserError), written_aside(cache) as aside:
+            aside.write_bytes(save(dict(vars(index)), metadata={"scene": state}))
+    return index
 
 
-def _digest(model: Any) -> str:
-    digest = hashlib.sha256(str(sorted(image.name for image in model.images.values())).encode())
-    for _, point in sorted(model.points3D.items()):
-        digest.update(point.xyz.tobytes())
+def _digest(scene: Scene) -> str:
+    digest = hashlib.sha256(repr([view.name for view in scene.views]).encode(errors="surrogateescape"))
+    for tensor in (scene.points, scene.observations):
+        digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 
 def _read_cache(file: Path, state: str) -> FeatureIndex | None:
     try:
+        check_regular(file)
         with safe_open(file, framework="np") as opened:
-            if (opened.metadata() or {}).get("model") != state:
+            if (opened.metadata() or {}).get("scene") != state:
                 return None
             return FeatureIndex(*(opened.get_tensor(key) for key in ("descriptors", "owners", "points")))
     except (OSError, SafetensorError):
         return None
 
 
-def _write_cache(file: Path, landmarks: FeatureIndex, state: str) -> None:
-    aside = file.with_name(file.name + ".part")
-    try:
-        aside.write_bytes(save(dict(vars(landmarks)), metadata={"model": state}))
-        aside.replace(file)
-    except (OSError, SafetensorError):
-        aside.unlink(missing_ok=True)
-
-
-def _find_landmarks(model: Any, images_dir: Path, progress: Progress | None) -> FeatureIndex:
-    chosen = _best_connected(model)
+def _index_features(scene: Scene, progress: Progress | None) -> FeatureIndex:
+    counts = torch.bincount(scene.observations[:, 0].long(), minlength=len(scene.views))
+    chosen = counts.argsort(descending=True, stable=True)[:MAX_PHOTOS]
+    chosen = chosen[counts[chosen] > 0].sort().values.tolist()
     if not chosen:
-        raise UserError(f"{images_dir}: the COLMAP model says of no photo which points it observes")
-    ids = sorted(model.points3D)
-    rows = {point_id: row for row, point_id in enumerate(ids)}
-    points = np.array([model.points3D[point_id].xyz for point_id in ids], dtype=np.float64)
-    descriptors, owners = [np.zeros((0, 128), np.uint8)], [np.zeros(0, np.int64)]
-    with tempfile.TemporaryDirectory(prefix="wildgs-features-") as work, quiet():
-        database = Path(work) / "features.db"
-        for start in range(0, len(chosen), BATCH):
-            batch = chosen[start : start + BATCH]
-            extract_named(database, images_dir, [image.name for image in batch])
-            with closing(pycolmap.Database.open(database)) as opened:
-                for image in batch:
-                    found, whose = _described_points(opened, image, rows)
-                    descriptors.append(found)
-                    owners.append(whose)
-            if progress is not None:
-                progress(min(start + BATCH, len(chosen)), len(chosen))
-    landmarks = FeatureIndex(np.concatenate(descriptors), np.concatenate(owners), points)
-    if len(landmarks.descriptors) == 0:
         raise UserError(
-            f"{images_dir}: no SIFT feature lies where the COLMAP model has its observations; new photos cannot be"
-            " localised against it"
+            f"{scene.root}: the sparse model does not say which points its photos observe, so new photos cannot be "
+            "localised; choose a photo of the scene whose camera they borrow (--like)"
         )
-    return landmarks
-
-
-def _best_connected(model: Any) -> list[Any]:
-    """The posed photos that observe the most points, at most `MAX_PHOTOS`, by name."""
-    posed = [image for image in model.images.values() if image.has_pose and image.num_points3D > 0]
-    posed.sort(key=lambda image: (-image.num_points3D, image.name))
-    return sorted(posed[:MAX_PHOTOS], key=lambda image: image.name)
-
-
-def extract_named(database: Path, images_dir: Path, names: Sequence[str]) -> None:
-    """Finds SIFT features of photos by name; what COLMAP cannot read is passed over."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = MAX_IMAGE_SIZE
-    pycolmap.extract_features(
-        database, images_dir, list(names), pycolmap.CameraMode.PER_IMAGE, extraction_options=options
-    )
+    points = scene.points.double().numpy()
+    descriptors, owners = [np.zeros((0, 128), np.uint8)], [np.zeros(0, np.int64)]
+    for done, row in enumerate(chosen, start=1):
+        observed = scene.observations[scene.observations[:, 0] == row][:, 1].long()
+        with contextlib.suppress(UserError):  # a photo that cannot be read is passed over
+            found, whose = _described_points(scene.views[row], scene.points, observed)
+            descriptors.append(found)
+            owners.append(whose)
+        if progress is not None:
+            progress(done, len(chosen))
+    index = FeatureIndex(np.concatenate(descriptors), np.concatenate(owners), points)
+    if len(index.descriptors) == 0:
+        raise UserError(
+            f"{scene.root}: no SIFT feature of its photos lies where the sparse model has a point, so new photos "
+            "cannot be localised; choose a photo of the scene whose camera they borrow (--like)"
+        )
+    return index
 
 
 def _described_points(
-    database: Any, image: Any, rows: dict[int, int]
+    view: View, points: Float[Tensor, "P 3"], observed: Int[Tensor, " O"]
 ) -> tuple[UInt8[np.ndarray, "D 128"], Int64[np.ndarray, " D"]]:
     """Descriptors of the features at a photo's observations, and the rows of the points observed."""
-    nothing = np.zeros((0, 128), np.uint8), np.zeros(0, np.int64)
-    stored = database.read_image_with_name(image.name)
-    if stored is None or not database.exists_descriptors(stored.image_id):
-        return nothing
-    features = database.read_keypoints(stored.image_id)[:, :2].astype(np.float64)
-    observed = [point for point in image.points2D if point.has_point3D()]
-    if len(features) == 0 or not observed:
-        return nothing
-    taken = database.read_camera(stored.camera_id)
-    camera = image.camera
-    features = features * [camera.width / taken.width, camera.height / taken.height]
-    reach = SAME_PLACE * max(camera.width, camera.height)
-    positions = np.array([point.xy for point in observed])
-    found = KDTree(positions).query(features, distance_upper_bound=max(reach, 1.0))
+    camera = view.camera
+    detail = view.photos.detail or MAX_IMAGE_SIZE
+    features, descriptors = find_features(view.read_photo().numpy(), min(MAX_IMAGE_SIZE, detail))
+    positions, depth = camera.project(points[observed])
+    in_front = depth > 0
+    positions, owners = positions[in_front].double().numpy(), observed[in_front].numpy()
+    if len(features) == 0 or len(owners) == 0:
+        return np.zeros((0, 128), np.uint8), np.zeros(0, np.int64)
+    long_side = max(camera.width, camera.height)
+    reach = max(SAME_PLACE * long_side, long_side / min(long_side, detail))
+    found = KDTree(positions).query(features, distance_upper_bound=reach)
     distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     near = np.isfinite(distance)
-    owners = np.array([rows[point.point3D_id] for point in observed], dtype=np.int64)
-    return database.read_descriptors(stored.image_id).data[near], owners[nearest[near]]
+    return descriptors[near], owners[nearest[near]]
+
+
+def find_features(
+    pixels: UInt8[np.ndarray, "H W 3"], limit: int = MAX_IMAGE_SIZE
+) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
+    """SIFT features of a photo.
+
+    Args:
+        pixels: RGB.
+        limit: Features are sought at no more than this many pixels on the long side.
+
+    Returns:
+        Positions in the photo's pixels, and descriptors.
+    """
+    height, width = pixels.shape[:2]
+    grey = Image.fromarray(pixels).convert("L")
+    grey.thumbnail((limit, limit), Image.Resampling.LANCZOS)
+    with quiet():
+        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+        keypoints, descriptors = extractor.extract_from_uint8_array(np.asarray(grey))
+    found = np.array([(point.x, point.y) for point in keypoints], dtype=np.float64).reshape(-1, 2)
+    return found * [width / grey.width, height / grey.height], np.array(descriptors.data).reshape(-1, 128)
 
 
 def match_features(
@@ -205,8 +194,6 @@ def _nearest(
     features: UInt8[np.ndarray, "F 128"], landmarks: FeatureIndex, count: int = 8, block: int = 65_536
 ) -> tuple[Shaped[np.ndarray, "F k"], Int64[np.ndarray, "F k"]]:
     """Cosine and owner of the descriptors most alike, the best first, without the whole table in memory."""
-    import torch
-
     queries = torch.nn.functional.normalize(torch.from_numpy(features).float(), dim=1)
     owners = torch.from_numpy(landmarks.owners)
     likeness, best = torch.zeros(len(queries), 0), torch.zeros(len(queries), 0, dtype=torch.int64)

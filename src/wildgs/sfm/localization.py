@@ -7,7 +7,7 @@ focal length is that of the EXIF block, or estimated with the pose.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,8 @@ from torch import Tensor
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.scene.images import UnreadableImageError, open_image, read_photo
-from wildgs.scene.scene import Alignment
 from wildgs.scene.undistort import PixelGrid, sample_colors
-from wildgs.sfm.feature_index import MAX_IMAGE_SIZE, FeatureIndex, match_features
+from wildgs.sfm.feature_index import FeatureIndex, find_features, match_features
 from wildgs.sfm.mapping import quiet
 from wildgs.sfm.upright import save_jpeg
 
@@ -80,15 +79,12 @@ class LocalizedPhoto:
         )
 
 
-def localize(
-    file: Path, landmarks: FeatureIndex, alignment: Alignment, long_side: int, *, seed: int = 0
-) -> LocalizedPhoto:
+def localize(file: Path, landmarks: FeatureIndex, long_side: int, *, seed: int = 0) -> LocalizedPhoto:
     """Finds the camera of a photo of the place.
 
     Args:
         file: The photo; any size, upright or with an EXIF orientation.
         landmarks: Of the scene.
-        alignment: From the model's frame to the scene's aligned one.
         long_side: Pixels to which the photo is shrunk for use.
         seed: Of RANSAC.
 
@@ -101,7 +97,7 @@ def localize(
     except UnreadableImageError as error:
         raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
     camera, known = guess_camera(file, pixels.shape[1], pixels.shape[0])
-    features, descriptors = _features(pixels)
+    features, descriptors = find_features(pixels)
     matched, seen = (np.zeros(0, np.int64),) * 2
     if len(features):
         matched, seen = match_features(descriptors, landmarks, MATCH_RATIO)
@@ -112,9 +108,7 @@ def localize(
             f"{file}: could not be localised ({inliers} inliers of {len(matched)} matches with the scene's"
             f" points; at least {MIN_INLIERS} are needed)"
         )
-    return _as_view(
-        pixels, camera, answer["cam_from_world"], alignment, long_side, inliers, len(matched), known
-    )
+    return _as_view(pixels, camera, answer["cam_from_world"], long_side, inliers, len(matched), known)
 
 
 def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
@@ -141,20 +135,6 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
         params=[focal * long_side, width / 2, height / 2, 0.0],
     )
     return camera, known
-
-
-def _features(
-    pixels: UInt8[np.ndarray, "H W 3"],
-) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
-    """SIFT features in the photo's pixels, and their descriptors."""
-    height, width = pixels.shape[:2]
-    grey = Image.fromarray(pixels).convert("L")
-    grey.thumbnail((MAX_IMAGE_SIZE, MAX_IMAGE_SIZE), Image.Resampling.LANCZOS)
-    with quiet():
-        extractor = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
-        keypoints, descriptors = extractor.extract_from_uint8_array(np.asarray(grey))
-    found = np.array([(point.x, point.y) for point in keypoints], dtype=np.float64).reshape(-1, 2)
-    return found * [width / grey.width, height / grey.height], np.array(descriptors.data)
 
 
 def _solve(
@@ -203,7 +183,6 @@ def _as_view(
     pixels: UInt8[np.ndarray, "H W 3"],
     camera: Any,
     pose: Any,
-    alignment: Alignment,
     long_side: int,
     inliers: int,
     matches: int,
@@ -217,10 +196,9 @@ def _as_view(
     photo = np.array(image) if source is None else sample_colors(np.asarray(image), source)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3] = torch.from_numpy(pose.matrix())
-    placed = alignment.apply_camera(Camera(viewmat, grid.K, grid.width, grid.height))
     return LocalizedPhoto(
         photo=torch.from_numpy(photo),
-        camera=replace(placed, viewmat=placed.viewmat.float(), K=placed.K.float()),
+        camera=Camera(viewmat.float(), grid.K.float(), grid.width, grid.height),
         inliers=inliers,
         matches=matches,
         focal=float(camera.params[0]) / longest,

@@ -146,10 +146,10 @@ def _copy_one(
             shutil.copyfile(source, target)  # as it is: encoding it again would lose a little
             return False, position
         save_jpeg(Image.fromarray(photo.pixels), image, target)
-    if photo.opaque is None or photo.opaque.all():
+    if photo.mask is None or photo.mask.all():
         return False, position
     masks_dir.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(photo.opaque).save(masks_dir / f"{target.name}.png")
+    Image.fromarray(photo.mask).save(masks_dir / f"{target.name}.png")
     return True, position
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.evaluation.metrics import psnr
-from wildgs.export.depth_colors import color_depth
+from wildgs.exporters.depth_colors import color_depth
 from wildgs.light.look import Look
 from wildgs.scene import View
 from wildgs.viewer.subject import Subject

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wildgs.export.depth_colors import color_depth
+from wildgs.exporters.depth_colors import color_depth
 from wildgs.light.look import Look
 from wildgs.viewer.splats import ENLARGED, Splats, as_viser, colors_from, distances_from, splats_of
 from wildgs.viewer.subject import Subject

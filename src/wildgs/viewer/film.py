@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from wildgs.errors import UserError
-from wildgs.export.video import write_frames
+from wildgs.exporters.video import write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.camera_file import write_camera_path
 from wildgs.geometry.trajectory import interpolate

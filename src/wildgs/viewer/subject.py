@@ -75,13 +75,10 @@ class Subject:
         """
         return self._find_look(spec if self.relightable else NEUTRAL, like=like)
 
-    def _photo(self, view: View) -> Float[Tensor, "H W 3"]:
-        return view.read_photo().to(self.device).float() / 255
-
     @torch.no_grad()
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
         """M of a photo (1 = static), in main memory; None for a method that predicts no mask."""
-        visibility = self.method.visibility(self._photo(view))
+        visibility = self.method.visibility(view.load(self.device)[0])
         return None if visibility is None else visibility.float().cpu()
 
     @torch.no_grad()
@@ -135,7 +132,7 @@ class TrainingSubject(Subject):
                 return super().look(spec, like)
             view = match_view(self.views, str(spec)) or match_view(self.views, like or "") or self.views[0]
             with torch.no_grad():
-                return look_of(self.method, self.method.parse(self._photo(view)), view.name)
+                return look_of(self.method, self.method.parse(view.load(self.device)[0]), view.name)
 
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
         """As `Subject.visibility`."""

@@ -1,0 +1,76 @@
+"""Options that several verbs share, and how help shows them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Annotated, Any, get_type_hints
+
+import tyro
+
+from wildgs.library.config import MixOptions
+
+NEUTRAL = "neutral"
+UNNAMED = tyro.conf.arg(name="")
+"""For a field whose options carry no prefix."""
+
+Mix = Annotated[MixOptions, UNNAMED]
+
+
+@dataclass(frozen=True)
+class LightOptions(MixOptions):
+    """Where the light comes from."""
+
+    appearance: tuple[str, ...] = (NEUTRAL,)
+    """Photos of the scene by name, new photos, any pictures, saved appearances, or neutral."""
+
+    @property
+    def mixing(self) -> MixOptions:
+        """How the appearances are found and mixed."""
+        return MixOptions(self.weights, self.global_, self.local, self.like)
+
+
+def option_name(path: str) -> str:
+    """The option that sets an entry of `config.yaml`: ``train.optimizer.means`` is ``--optimizer.means``."""
+    first, _, rest = path.partition(".")
+    return f"--{(rest or first).replace('_', '-')}"
+
+
+def count_options(kind: type) -> int:
+    """How many options a command has."""
+    hints = get_type_hints(kind)
+    nested = [hints[f.name] for f in dataclasses.fields(kind)]
+    return sum(count_options(inner) if dataclasses.is_dataclass(inner) else 1 for inner in nested)  # pyright: ignore[reportArgumentType]
+
+
+def with_only(kind: type, shown: Collection[str], prefix: str = "") -> type:
+    """A command whose help shows some of its options; the others cannot be given to it.
+
+    Args:
+        kind: The command's dataclass.
+        shown: Paths of the fields to show, as in ``train.steps``; required fields are always shown.
+        prefix: Path of `kind` within the command.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    plain = get_type_hints(kind)
+    fields: list[tuple[str, Any, Any]] = []
+    for entry in dataclasses.fields(kind):
+        path, hint = prefix + entry.name, hints[entry.name]
+        required = entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
+        if required or path in shown:
+            continue
+        default = entry.default
+        if default is dataclasses.MISSING:
+            assert entry.default_factory is not dataclasses.MISSING
+            default = entry.default_factory()
+        if any(name.startswith(path + ".") for name in shown):
+            inner = with_only(plain[entry.name], shown, path + ".")
+            value = inner(**{f.name: getattr(default, f.name) for f in dataclasses.fields(inner)})
+            metadata = getattr(hint, "__metadata__", ())
+            fields.append((entry.name, Annotated[(inner, *metadata)], field(default=value)))  # pyright: ignore[reportInvalidTypeForm]
+        else:
+            fields.append((entry.name, Annotated[hint, tyro.conf.Suppress], field(default=default)))
+    made = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True, kw_only=True)
+    made.__doc__ = kind.__doc__
+    return made

@@ -1,0 +1,222 @@
+"""What the command line prints: progress bars, lines, tables, and all of it lost rather than the work."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from wildgs import processes
+
+if TYPE_CHECKING:
+    from wildgs.engine.trainer import StepReport
+    from wildgs.library.evaluation import Scores
+    from wildgs.library.pipeline import FinishedRun
+    from wildgs.light.look import Look
+
+LINE_SECONDS = 10.0
+REFRESH_STEPS = 10
+
+
+class Forgiving:
+    """Standard output or error, from which nobody may be reading: what cannot be shown is dropped.
+
+    A full disk under a redirection, a pipe without a reader and a closed terminal must not end a training.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Sets up a `Forgiving`.
+
+        Args:
+            name: `stdout` or `stderr`; looked up at every write, since tests and notebooks exchange them.
+        """
+        self._name = name
+
+    @property
+    def _stream(self) -> Any:
+        return getattr(sys, self._name)
+
+    def write(self, text: str) -> int:
+        """Writes, if it can."""
+        try:
+            try:
+                return self._stream.write(text)
+            except UnicodeEncodeError:  # names of files may be anything
+                return self._stream.write(text.encode("ascii", "backslashreplace").decode("ascii"))
+        except (
+            OSError,
+            ValueError,
+            RuntimeError,
+            AttributeError,
+        ):  # closed, full, reentered, or no stream at all
+            return len(text)
+
+    def flush(self) -> None:
+        """Flushes, if it can."""
+        try:
+            self._stream.flush()
+        except (OSError, ValueError, RuntimeError, AttributeError):
+            return
+
+    def isatty(self) -> bool:
+        """Whether a person looks at it."""
+        try:
+            return self._stream.isatty()
+        except (OSError, ValueError, AttributeError):
+            return False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+OUT, ERR = Forgiving("stdout"), Forgiving("stderr")
+
+# Names of files and photos are the user's text, which may look like rich's markup.
+console = Console(file=OUT, highlight=False, soft_wrap=True, markup=False, emoji=False)  # pyright: ignore[reportArgumentType]
+
+
+class Lines(logging.Handler):
+    """Prints what the library logs: one line each."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints a record of level INFO; warnings are printed where they are raised."""
+        if record.levelno == logging.INFO and not processes.rank():
+            console.print(record.getMessage())
+
+
+class Screen:
+    """Shows progress: a `Progress`, and an observer of training by its method `step`."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        self._detail = ""
+        self._first, self._started, self._last_line = 0, 0.0, 0.0
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        """Shows that `done` of `total` pieces of a stage are finished; as a line where there is no terminal."""
+        if stage != self._stage:
+            self._begin(stage, done, total)
+        if self._bar is not None:
+            self._bar.update(
+                self._task, completed=done, total=total or None, detail=self._detail or f"{done}/{total}"
+            )
+        elif self._detail:
+            self._line(done, total)
+        elif total and done == total and not stage.startswith("training"):
+            console.print(f"{stage}: {total} done")
+        if total and done == total:
+            self.close()
+
+    def step(self, report: StepReport) -> None:
+        """Notes what is worth showing of a training step."""
+        if not report.falls_on(REFRESH_STEPS):
+            return
+        rate = (report.step - self._first) / max(time.monotonic() - self._started, 1e-6)
+        loss = float(report.losses.total.detach())
+        self._detail = f"{rate:.1f} steps/s  loss {loss:.4f}  {report.num_gaussians:,} Gaussians"
+
+    def close(self) -> None:
+        """Ends the present bar."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._bar, self._stage, self._detail = None, "", ""
+
+    def _begin(self, stage: str, done: int, total: int) -> None:
+        self.close()
+        self._stage, self._first = stage, done
+        self._started = self._last_line = time.monotonic()
+        if console.is_terminal and not console.quiet:
+            self._bar = _bar()
+            self._task = self._bar.add_task(stage, total=total or None, completed=done, detail="")
+            self._bar.start()
+        elif stage.startswith("training"):
+            console.print(f"{stage}: {total - done} steps")
+
+    def _line(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done != total and now - self._last_line < LINE_SECONDS:
+            return
+        self._last_line = now
+        left = (total - done) * (now - self._started) / max(done - self._first, 1)
+        console.print(f"{self._stage}: step {done}/{total}  {self._detail}  {_clock(left)} left")
+
+
+@contextmanager
+def progress_shown() -> Iterator[Screen]:
+    """A `Screen` for the time of a block."""
+    screen = Screen()
+    try:
+        yield screen
+    finally:
+        screen.close()
+
+
+def print_notes(looks: Iterable[Look]) -> None:
+    """Says of appearances how they were found, where that is worth a line."""
+    for look in looks:
+        if look.note:
+            console.print(f"{look.name}: {look.note}")
+
+
+def print_finished(finished: FinishedRun) -> None:
+    """Prints the scores, and where the pages are."""
+    if finished.scores:
+        print_scores(finished.scores)
+    console.print(f"open {finished.report.resolve()} in a browser: scores and comparisons")
+    console.print(f"open {finished.page.resolve()} in a browser: the scene itself, under several lights")
+
+
+def print_scores(runs: Mapping[str, Scores]) -> None:
+    """Prints one table over runs and protocols, then what could not be computed."""
+    table = Table("run", "protocol", "PSNR", "SSIM", "LPIPS", "Gaussians", "frames/s")
+    notes: dict[str, None] = {}
+    for name, protocols in runs.items():
+        for protocol, metrics in protocols.items():
+            mean = metrics["mean"]
+            cells = [_number(mean["psnr"], 2), _number(mean["ssim"], 3), _number(mean["lpips"], 3)]
+            table.add_row(
+                name, protocol, *cells, f"{metrics['num_gaussians']:,}", _number(metrics["render_fps"], 0)
+            )
+            notes |= dict.fromkeys(metrics.get("notes", ()))
+    console.print(table)
+    for note in notes:
+        console.print(note, style="dim")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _bar() -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[detail]}", markup=False),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=False,
+    )
+
+
+def _clock(left: float) -> str:
+    minutes, seconds = divmod(round(left), 60)
+    return f"{minutes}:{seconds:02d}"

@@ -1,0 +1,216 @@
+"""A self-contained web page with a scene under several appearances: opens from disk, without server or network."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from wildgs.exporters.page_scene import PackedScene, pack_scene
+from wildgs.exporters.splats import Splats
+from wildgs.files import written_aside
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
+
+BUDGET_BYTES = 25_000_000
+"""Size limit of a page; degrees of the spherical harmonics are dropped to stay below it."""
+
+_MIDDLE = 0.3
+"""Half size of the central part of a picture whose points give the distance of the landmark."""
+
+THUMBNAIL = (288, 192)
+_QUALITY = 82
+
+
+@dataclass(frozen=True)
+class PageLight:
+    """One light of the page.
+
+    Attributes:
+        name: Caption of the thumbnail.
+        sh: Spherical harmonics of all Gaussians.
+        thumbnail: Picture of any size; its centre is shown.
+    """
+
+    name: str
+    sh: Float[Tensor, "N K 3"]
+    thumbnail: UInt8[np.ndarray, "_ _ 3"]
+
+
+@dataclass(frozen=True)
+class PageView:
+    """Initial view of the page.
+
+    Attributes:
+        camera: Camera in the aligned frame of the scene (+z up).
+        depth: Depth of the centre of orbiting, world units.
+    """
+
+    camera: Camera
+    depth: float
+
+
+@dataclass(frozen=True)
+class Page:
+    """Content of a page.
+
+    Attributes:
+        title: Headline.
+        summary: Sentence in its help panel.
+        splats: Geometry, in the aligned frame of the scene.
+        lights: Appearances, from left to right.
+        start: Initial view.
+        near: Near plane, world units.
+    """
+
+    title: str
+    summary: str
+    splats: Splats
+    lights: Sequence[PageLight]
+    start: PageView
+    near: float
+
+
+def write_page(
+    page: Page,
+    file: Path,
+    *,
+    viewpoints: Float[Tensor, "V 3"] | None = None,
+    sh_degree: int | None = None,
+) -> int:
+    """Writes a page atomically.
+
+    Args:
+        page: Content.
+        file: HTML file; missing folders are created.
+        viewpoints: Camera centres; truncated harmonics are fitted to the directions from them.
+        sh_degree: Degree of the spherical harmonics; None takes the highest that keeps the page below
+            `BUDGET_BYTES`.
+
+    Returns:
+        Degree of the spherical harmonics in the page.
+
+    Raises:
+        ValueError: The page has no light or no Gaussian.
+    """
+    own = page.splats.sh_degree
+    content = b""
+    for degree in range(own, -1, -1) if sh_degree is None else [min(sh_degree, own)]:
+        content = _compose(page, _pack(page, degree, viewpoints)).encode()
+        if len(content) <= BUDGET_BYTES:
+            break
+    with written_aside(file) as aside:
+        aside.write_bytes(content)
+    return degree
+
+
+def _pack(page: Page, degree: int, viewpoints: Float[Tensor, "V 3"] | None) -> PackedScene:
+    fit = None
+    if degree < page.splats.sh_degree and viewpoints is not None and len(viewpoints):
+        fit = fit_truncation(page.splats.means, viewpoints, page.splats.sh_degree, degree)
+    return pack_scene(page.splats, [truncate_sh(light.sh, degree, fit).numpy() for light in page.lights])
+
+
+def _compose(page: Page, scene: PackedScene) -> str:
+    """The HTML text."""
+    web = files("wildgs.exporters").joinpath("web")
+    header = {
+        **scene.header,
+        "near": page.near,
+        "start": _start(page.start),
+        "lights": [{"name": light.name, "thumbnail": _thumbnail(light.thumbnail)} for light in page.lights],
+    }
+    return Template(web.joinpath("page.html").read_text(encoding="utf-8")).substitute(
+        title=escape(page.title),
+        summary=escape(page.summary),
+        style=web.joinpath("style.css").read_text(encoding="utf-8"),
+        licenses=escape(web.joinpath("LICENSES.txt").read_text(encoding="utf-8")),
+        header=script_json(header),
+        scene=base64.b64encode(scene.data).decode("ascii"),
+        viewer=base64.b64encode(web.joinpath("viewer.js.gz").read_bytes()).decode("ascii"),
+    )
+
+
+def script_json(value: Any) -> str:
+    """JSON that cannot close the enclosing script element, whatever file names it contains."""
+    return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _start(view: PageView) -> dict[str, Any]:
+    camera = view.camera
+    target = camera.position + view.depth * camera.forward
+    return {
+        "position": camera.position.tolist(),
+        "target": target.tolist(),
+        "fov_y": float(2 * torch.atan(0.5 * camera.height / camera.K[1, 1])),
+        "aspect": float(camera.width / camera.height * camera.K[1, 1] / camera.K[0, 0]),
+    }
+
+
+def _thumbnail(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
+    """Centre crop of a picture as a data URL."""
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    wide, tall = THUMBNAIL
+    scale = max(wide / image.width, tall / image.height)
+    size = (max(wide, round(image.width * scale)), max(tall, round(image.height * scale)))
+    image = image.resize(size, Image.Resampling.LANCZOS)
+    left, top = (image.width - wide) // 2, (image.height - tall) // 2
+    buffer = io.BytesIO()
+    image.crop((left, top, left + wide, top + tall)).save(buffer, "JPEG", quality=_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tuple[int, float]:
+    """Chooses the photo from which the landmark is seen whole and large.
+
+    Args:
+        cameras: Cameras of the training photos, at least one.
+        points: SfM points in the same frame.
+
+    Returns:
+        Index of the camera, and the depth of the landmark in it, world units.
+    """
+    scores = torch.tensor([_score(camera, points) for camera in cameras])
+    best = int(scores.argmax())
+    return best, _depth(cameras[best], points)
+
+
+def _project(camera: Camera, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
+    """Image coordinates (0 to 1 on each axis) and depths of the points in front of the camera."""
+    pixels, depths = camera.project(points)
+    before = depths > 1e-3
+    return pixels[before] / torch.tensor([camera.width, camera.height]).to(points), depths[before]
+
+
+def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
+    """Share of the points inside the picture, times the share of the picture that they cover.
+
+    The first factor is small for cameras that are too close, the second for those too far away.
+    """
+    places, _ = _project(camera, points)
+    inside = places[((places >= 0) & (places <= 1)).all(dim=1)]
+    if len(inside) < 2:
+        return 0.0
+    spread = inside.quantile(0.95, dim=0) - inside.quantile(0.05, dim=0)
+    return len(inside) / len(points) * float(spread.prod().sqrt())
+
+
+def _depth(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
+    """Median depth of the points in the central part of the picture."""
+    places, depths = _project(camera, points)
+    middle = ((places - 0.5).abs() < _MIDDLE).all(dim=1)
+    chosen = depths[middle] if bool(middle.any()) else depths
+    return float(chosen.median()) if len(chosen) else 1.0

@@ -1,0 +1,351 @@
+"""`wildgs.benchmark`: methods x ablations x seeds on any scenes, one table."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import filelock
+import torch
+
+from wildgs import processes
+from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.engine.checkpoint import list_checkpoints
+from wildgs.engine.distributed import settle
+from wildgs.engine.trainer import Observer
+from wildgs.errors import UserError
+from wildgs.evaluation.benchmark import Row, Score, summarize
+from wildgs.evaluation.benchmark_table import to_csv, to_markdown, to_records
+from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.pictures import write_json
+from wildgs.evaluation.protocol import Protocol
+from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
+from wildgs.evaluation.published import published_figures
+from wildgs.files import written_aside
+from wildgs.library.benchmark_plan import (
+    LABELS,
+    PHOTOTOURISM_DOWNSCALE,
+    Job,
+    find_phototourism,
+    make_jobs,
+    parse_variant,
+)
+from wildgs.library.config import METHODS, BenchMethod, Suite
+from wildgs.library.evaluation import PROTOCOLS, evaluate
+from wildgs.library.logs import logger
+from wildgs.library.training import read_scene, train
+from wildgs.progress import Progress
+from wildgs.runs import CHECKPOINT_FOLDER, load_run
+from wildgs.scene import Scene
+from wildgs.version import __version__
+
+MOST_NOTES = 12
+CLAIM_FILE = ".bench.lock"
+FAILURE_FILE = "bench_failure.txt"
+"""In the folder of a run that failed: why. A later bench tries the run again."""
+POLL_SECONDS = 2.0
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What a benchmark left.
+
+    Attributes:
+        folder: Holds table.md, table.csv, table.json and the runs.
+        rows: The table.
+        runs: How many runs the table asks for.
+        failures: Why runs failed, by title.
+    """
+
+    folder: Path
+    rows: list[Row]
+    runs: int
+    failures: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What all runs have in common."""
+
+    output: Path
+    suite: Suite | None
+    variants: Sequence[str]
+    lpips: Path | None
+    execution: ExecutionConfig
+    progress: Progress | None
+    observers: Sequence[Observer]
+    announce: Callable[[str], None]
+
+
+def benchmark(
+    scenes: Sequence[str | Path],
+    config: RunConfig | None = None,
+    *,
+    output: str | Path = "wildgs-bench",
+    methods: Sequence[BenchMethod] = METHODS,
+    variants: Sequence[str] = (),
+    seeds: Sequence[int] = (0, 1, 2),
+    suite: Suite | None = None,
+    lpips: str | Path | None = None,
+    execution: ExecutionConfig | None = None,
+    progress: Progress | None = None,
+    observers: Sequence[Observer] = (),
+    announce: Callable[[str], None] | None = None,
+) -> Benchmark:
+    """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
+
+    The same call goes on where it stopped and skips what is done. A run that fails is named, and the others go on.
+
+    Args:
+        scenes: Scene folders; for a suite, the folder that holds its scenes.
+        config: What all runs have in common.
+        output: Folder for the runs and the table.
+        methods: Lines of the table.
+        variants: Further lines, ``NAME:KEY=VALUE[,KEY=VALUE...]``: Wild-GS with entries of config.yaml changed.
+        seeds: One run each.
+        suite: `phototourism` compares with the paper's figures on its three scenes.
+        lpips: Folder with LPIPS weights, where they are not in torch's cache.
+        execution: How runs are executed.
+        progress: Called during all stages of all runs.
+        observers: Called with a `StepReport` after every training step.
+        announce: Called with a line for every run that begins or fails, on every process.
+
+    Raises:
+        UserError: Something that was asked for does not exist, or the output holds other runs.
+    """
+    request = _Request(
+        Path(output),
+        suite,
+        variants,
+        None if lpips is None else Path(lpips),
+        execution or ExecutionConfig(),
+        progress,
+        observers,
+        announce or logger.info,
+    )
+    if processes.world_size() > 1:
+        settle()
+    base = config or RunConfig()
+    jobs = _plan(request, [Path(s) for s in scenes], base, methods, seeds)
+    bench = _Bench(request, jobs)
+    done = sum(map(bench.is_done, jobs))
+    if processes.rank() == 0:
+        logger.info("%d runs, %d of them done already -> %s", len(jobs), done, request.output)
+    for number, job in bench.open_jobs():
+        request.announce(f"run {number + 1} of {len(jobs)}: {job.title}")
+        bench.do(job)
+        bench.write_table()
+    return Benchmark(request.output, bench.write_table(), len(jobs), bench.failures())
+
+
+def _plan(
+    request: _Request,
+    scenes: Sequence[Path],
+    base: RunConfig,
+    methods: Sequence[BenchMethod],
+    seeds: Sequence[int],
+) -> list[Job]:
+    if not scenes or not seeds or not (methods or request.variants):
+        raise UserError("a bench needs at least one scene, one of --methods or --variant, and one of --seeds")
+    if request.suite == "phototourism":
+        scenes = find_phototourism(scenes)
+        if base.data.downscale == 1:
+            base = replace(base, data=replace(base.data, downscale=PHOTOTOURISM_DOWNSCALE))
+    parsed = [parse_variant(text) for text in request.variants]
+    return make_jobs(scenes, base, methods, parsed, seeds, request.output)
+
+
+class _Bench:
+    """Runs jobs and gathers their scores; what is known of a job is what its folder holds."""
+
+    def __init__(self, request: _Request, jobs: Sequence[Job]) -> None:
+        self.request = request
+        self.jobs = jobs
+        self._began = time.time()
+        lpips, _ = load_lpips(request.lpips)
+        self._network = None if lpips is None else lpips.network
+        self._scene: tuple[RunConfig, Scene] | None = None
+
+    def is_done(self, job: Job) -> bool:
+        """Whether a job is trained and scored under both protocols, with the LPIPS network at hand."""
+        return all(self._is_scored(job, protocol) for protocol in PROTOCOLS)
+
+    def _is_scored(self, job: Job, protocol: Protocol) -> bool:
+        metrics = read_metrics(job.folder, protocol)
+        if metrics is None or metrics["step"] != job.config.train.steps:
+            return False
+        same_network = self._network is None or metrics.get("lpips_network") == self._network
+        # A finished run whose checkpoints were deleted keeps its scores.
+        return same_network or not list_checkpoints(job.folder / CHECKPOINT_FOLDER)
+
+    def open_jobs(self) -> Iterator[tuple[int, Job]]:
+        """Jobs that are neither done nor failed, with their numbers, until none is left; waits for other processes.
+
+        A process that ends without finishing its job leaves it open, and one of the others takes it.
+        """
+        tried: set[int] = set()
+        while True:
+            waiting = False
+            for number, job in enumerate(self.jobs):
+                if number in tried or self._is_closed(job):
+                    continue
+                with _claim(job.folder) as claimed:
+                    waiting |= not claimed
+                    if claimed and not self._is_closed(job):
+                        tried.add(number)
+                        yield number, job
+            if not waiting:
+                return
+            time.sleep(POLL_SECONDS)
+
+    def _is_closed(self, job: Job) -> bool:
+        return self.is_done(job) or self.failure(job) is not None
+
+    def failure(self, job: Job) -> str | None:
+        """Why a job failed since this bench began, in whatever process; None where it did not."""
+        file = job.folder / FAILURE_FILE
+        try:
+            return file.read_text(encoding="utf-8") if file.stat().st_mtime >= self._began else None
+        except OSError:
+            return None
+
+    def failures(self) -> dict[str, str]:
+        """All jobs that failed, by title."""
+        found = {job.title: self.failure(job) for job in self.jobs}
+        return {title: reason for title, reason in found.items() if reason is not None}
+
+    def do(self, job: Job) -> None:
+        """Trains and scores what is left of a job; notes its failure in the run folder."""
+        try:
+            scene = self._read_scene(job.config)
+            train_job(job, scene, self.request)
+            self._score(job, scene)
+            (job.folder / FAILURE_FILE).unlink(missing_ok=True)
+        except (UserError, MemoryError, torch.OutOfMemoryError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            _write_text(job.folder / FAILURE_FILE, reason)
+            self.request.announce(f"failed: {reason}")
+
+    def _read_scene(self, config: RunConfig) -> Scene:
+        """The scene of a run, kept for the next run where that reads it alike."""
+        if self._scene is None or (self._scene[0].scene, self._scene[0].data) != (config.scene, config.data):
+            self._scene = None  # frees its photos before the next scene's are read
+            self._scene = config, read_scene(config, self.request.execution, self.request.progress)
+        scene = self._scene[1]
+        if not scene.test_views:
+            raise UserError(
+                f"{scene.root} holds out no photo to score: mark some as 'test' in its split .tsv"
+            )
+        return scene
+
+    def _score(self, job: Job, scene: Scene) -> None:
+        missing: list[Protocol] = [protocol for protocol in PROTOCOLS if not self._is_scored(job, protocol)]
+        if missing:
+            loaded = load_run(job.folder)
+            evaluate(loaded, missing, scene=scene, lpips=self.request.lpips, progress=self.request.progress)
+
+    def write_table(self) -> list[Row]:
+        """The table of all jobs that are done, on disk."""
+        done = [job for job in self.jobs if self.is_done(job)]
+        scores = [
+            Score(job.scene, job.method, job.seed, metrics)
+            for job in done
+            for protocol in PROTOCOLS
+            if (metrics := read_metrics(job.folder, protocol)) is not None
+        ]
+        labels = dict.fromkeys([job.method for job in self.jobs])
+        names = {name: LABELS.get(name, name) for name in labels}
+        published = self.request.suite is not None
+        rows = summarize(
+            scores,
+            (PUBLISHED_LABELS if published else {}) | names,
+            published=published_figures if published else None,
+        )
+        output = self.request.output
+        heading = f"{len(done)} of {len(self.jobs)} runs, wildgs {__version__}."
+        _write_text(output / "table.md", to_markdown(rows, heading, [*self._variants(), *_notes(scores)]))
+        _write_text(output / "table.csv", to_csv(rows))
+        runs = [self._record(job) for job in done]
+        write_json(output / "table.json", {"wildgs": __version__, "runs": runs, "rows": to_records(rows)})
+        return rows
+
+    def _variants(self) -> list[str]:
+        return [
+            f"{name}: `{entries}`." for name, _, entries in (v.partition(":") for v in self.request.variants)
+        ]
+
+    def _record(self, job: Job) -> dict[str, Any]:
+        scores = {
+            protocol: {name: value for name, value in metrics.items() if name != "images"}
+            for protocol in PROTOCOLS
+            if (metrics := read_metrics(job.folder, protocol)) is not None
+        }
+        folder = job.folder.relative_to(self.request.output).as_posix()
+        return {
+            "scene": job.scene,
+            "method": job.method,
+            "seed": job.seed,
+            "folder": folder,
+            "scores": scores,
+        }
+
+
+def train_job(job: Job, scene: Scene, request: _Request) -> None:
+    """Trains a run from where it stands to its end."""
+    train(
+        scene,
+        job.config,
+        output=job.folder,
+        execution=request.execution,
+        resume="auto",
+        progress=request.progress,
+        observers=request.observers,
+    )
+
+
+def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
+    """The scores of a run, None where there are none that can be read."""
+    try:
+        content = json.loads((folder / "eval" / protocol / "metrics.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) and "step" in content and "mean" in content else None
+
+
+def _notes(scores: Sequence[Score]) -> list[str]:
+    """What the scores' own notes say, each once; the legend has said already which network LPIPS has."""
+    notes = dict.fromkeys(note for score in scores for note in score.metrics.get("notes", ()))
+    lines = [note for note in notes if not note.startswith("LPIPS v0.1")]
+    more = len(lines) - MOST_NOTES
+    return lines[:MOST_NOTES] + ([f"{more} more notes in the runs' metrics.json."] if more > 0 else [])
+
+
+@contextmanager
+def _claim(folder: Path) -> Iterator[bool]:
+    """Whether this process may work in a run folder while the block runs; the claim ends with the process."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / CLAIM_FILE, timeout=0)
+        lock.acquire()
+    except filelock.Timeout:
+        yield False
+        return
+    except NotImplementedError:  # a disk without locks; processes that share it may repeat each other's work
+        yield True
+        return
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+def _write_text(file: Path, text: str) -> None:
+    with written_aside(file) as aside:
+        aside.write_text(text, encoding="utf-8")

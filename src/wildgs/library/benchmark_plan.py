@@ -1,0 +1,217 @@
+"""What `wildgs bench` has to do: methods and variants, scenes, and a run for each seed of each."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from wildgs.config import RunConfig, differing_entries, read_config, with_entries
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.evaluation.published import PHOTOTOURISM
+from wildgs.library.config import METHODS, BenchMethod
+from wildgs.model.config import WildGSConfig
+from wildgs.presets import with_preset
+from wildgs.runs import CONFIG_FILE
+from wildgs.scene.colmap import find_model
+from wildgs.scene.split import find_split_file
+
+LABELS: dict[str, str] = {
+    "3dgs": "3DGS",
+    "wildgs-half-steps": "Wild-GS†",
+    "wildgs": "Wild-GS",
+    "paper": "preset paper",
+    "fast": "preset fast",
+    "without-crop": "w/o Crop",
+    "without-reverse": "w/o {c'}",
+    "without-global": "w/o Global",
+    "without-mask": "w/o Mask",
+    "without-depth": "w/o Depth",
+    "without-intrinsic": "w/o Intrinsic",
+    "without-local": "w/o Local",
+}
+"""As the paper's table has them."""
+
+PHOTOTOURISM_DOWNSCALE = 2
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_NEXT_ENTRY = re.compile(r",(?=[\w.]+=)")
+_BENCH_ENTRIES = {"scene": "give it as SCENE", "train.seed": "give --seeds"}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Wild-GS, or another method, with some entries of its configuration changed."""
+
+    name: str
+    entries: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to train and to score.
+
+    Attributes:
+        scene: The scene's name in the table.
+        method: A `BenchMethod` or a variant's name.
+        seed: Of the run.
+        folder: Its run folder.
+        config: Its configuration.
+    """
+
+    scene: str
+    method: str
+    seed: int
+    folder: Path
+    config: RunConfig
+
+    @property
+    def title(self) -> str:
+        """For the console."""
+        return f"{self.scene}, {LABELS.get(self.method, self.method)}, seed {self.seed}"
+
+
+def parse_variant(text: str) -> Variant:
+    """Reads ``NAME:KEY=VALUE[,KEY=VALUE...]``; keys are paths in `config.yaml`, values JSON or YAML.
+
+    Raises:
+        UserError: It has another form, or changes what the bench itself sets.
+    """
+    name, colon, rest = text.partition(":")
+    if not colon or not _NAME.fullmatch(name):
+        raise UserError(
+            f"--variant {text}: expected NAME:KEY=VALUE, for example slow:train.optimizer.networks=5e-4"
+        )
+    if name in METHODS:
+        raise UserError(f"--variant {text}: {name} is a method of the bench; choose another name")
+    entries: dict[str, Any] = {}
+    for entry in _NEXT_ENTRY.split(rest):
+        key, equals, value = entry.partition("=")
+        if not equals or not key.strip():
+            raise UserError(
+                f"--variant {text}: {entry!r} is not KEY=VALUE; the keys are those of config.yaml"
+            )
+        if key.strip() in _BENCH_ENTRIES:
+            raise UserError(
+                f"--variant {text}: {key.strip()} is not a variant's; {_BENCH_ENTRIES[key.strip()]}"
+            )
+        entries[key.strip()] = _plain(value)
+    return Variant(name, entries)
+
+
+def _plain(text: str) -> Any:
+    try:
+        return json.loads(text)  # first, since YAML takes 2e-3 for a word
+    except ValueError:
+        pass
+    try:
+        return yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError):
+        return text
+
+
+def find_phototourism(places: Sequence[Path]) -> tuple[Path, ...]:
+    """The paper's scenes among folders, or one level below them, with a warning for those that are not there.
+
+    Raises:
+        UserError: None is there, or one lacks its NeRF-W split: the paper's figures stand for those photos only.
+    """
+    candidates = [*places, *(place / name for place in places for name in PHOTOTOURISM)]
+    found = {path.resolve().name: path for path in reversed(candidates) if path.is_dir()}
+    scenes = tuple(found[name] for name in PHOTOTOURISM if name in found)
+    missing = ", ".join(name for name in PHOTOTOURISM if name not in found)
+    places_named = ", ".join(map(str, places))
+    if not scenes:
+        raise UserError(f"{places_named}: none of the suite's scenes ({missing}) is there")
+    if missing:
+        warnings.warn(f"{places_named}: no {missing}; the table goes without", WildGSWarning, stacklevel=2)
+    for scene in scenes:
+        if find_split_file(scene) is None:
+            raise UserError(
+                f"{scene}: no split; put NeRF-W's .tsv of this scene into it (without it, the paper's figures "
+                "would stand beside those of other photos)"
+            )
+    return scenes
+
+
+def make_jobs(
+    scenes: Sequence[Path],
+    base: RunConfig,
+    methods: Sequence[BenchMethod],
+    variants: Sequence[Variant],
+    seeds: Sequence[int],
+    output: Path,
+) -> list[Job]:
+    """All runs: scene by scene, seed by seed, so that the first seed's table is complete early.
+
+    Args:
+        scenes: Scene folders.
+        base: What all runs share; its scene and seed are replaced.
+        methods: Of the bench.
+        variants: Changes of `base`.
+        seeds: One run each.
+        output: The bench's folder; runs go to OUTPUT/<scene>/<method>/seed_<n>.
+
+    Raises:
+        UserError: A folder is no scene, names collide, an entry of a variant does not exist, or a run folder
+            holds a run with other settings.
+    """
+    _check_unique("scene", [scene.resolve().name for scene in scenes])
+    _check_unique("--variant", [variant.name for variant in variants])
+    _check_unique("--methods", methods)
+    _check_unique("--seeds", [str(seed) for seed in seeds])
+    configs = {method: method_config(method, base) for method in methods}
+    configs |= {v.name: with_entries(base, v.entries, f"--variant {v.name}: config") for v in variants}
+    jobs = []
+    for scene in (scene.resolve() for scene in scenes):
+        find_model(scene)
+        for seed in seeds:
+            for method, config in configs.items():
+                train = replace(config.train, seed=seed)
+                folder = output / scene.name / method / f"seed_{seed}"
+                jobs.append(Job(scene.name, method, seed, folder, replace(config, scene=scene, train=train)))
+    for job in jobs:
+        _check_stored(job)
+    return jobs
+
+
+def _check_unique(what: str, names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"{what}: {name} is there twice; the table needs different names")
+
+
+def method_config(method: BenchMethod, base: RunConfig) -> RunConfig:
+    """The configuration of one of the bench's methods."""
+    if method == "3dgs":
+        return replace(base, method="3dgs", model=WildGSConfig())  # on which the model has no effect
+    if method == "wildgs-half-steps":
+        return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
+    if method == "wildgs":
+        return base
+    if method in ("paper", "fast"):
+        return with_preset(base, method)
+    part = method.removeprefix("without-")
+    return with_entries(base, {"model.without": [*base.model.without, part]})
+
+
+def _check_stored(job: Job) -> None:
+    """Refuses a folder whose run has other settings: their scores must not stand in one table."""
+    file = job.folder / CONFIG_FILE
+    if not file.is_file():
+        return
+    differing = differing_entries(read_config(file), job.config)
+    budget = differing.get("train.density.max_gaussians")
+    if budget is not None and budget[0] < budget[1]:  # lowered where memory was short
+        del differing["train.density.max_gaussians"]
+    if differing:
+        entry, (stored, asked) = next(iter(differing.items()))
+        raise UserError(
+            f"{job.folder} holds a run with other settings ({entry}: {stored} there, {asked} asked for); choose "
+            "another --output or another variant's name"
+        )

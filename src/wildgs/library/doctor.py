@@ -1,0 +1,240 @@
+"""`wildgs.examine`: what works on this machine."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+State = Literal["works", "missing", "broken"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the report.
+
+    Attributes:
+        name: What was looked at.
+        state: `missing` is something to get; `broken` is there and fails.
+        detail: What was found, or why it does not work and what is lost.
+        remedy: The command that gets it; None where there is nothing to do.
+    """
+
+    name: str
+    state: State
+    detail: str
+    remedy: str | None = None
+
+
+def examine() -> list[Check]:
+    """All checks, each guarded: one that raises is reported as broken."""
+    probes: list[tuple[str, Callable[[], Check]]] = [
+        ("Python", _python),
+        ("PyTorch", _torch),
+        ("CPU", _cpu),
+        ("Numba", _numba),
+        ("rasteriser on the CPU", _cpu_rasterizer),
+        ("rasteriser on CUDA", _cuda_rasterizer),
+        ("poses from photos", _pycolmap),
+        ("encoder weights", _encoder_weights),
+        ("depth weights", _depth_weights),
+        ("LPIPS weights", _lpips),
+        ("viewer", _viewer),
+        ("videos", _videos),
+    ]
+    checks = []
+    for name, probe in probes:
+        try:
+            checks.append(probe())
+        except Exception as error:  # the doctor reports what fails, of whatever kind
+            first = (str(error).splitlines() or [""])[0]
+            checks.append(Check(name, "broken", f"{type(error).__name__}: {first}"))
+    return checks
+
+
+def _python() -> Check:
+    version = importlib.metadata.version("wildgs")
+    return Check("Python", "works", f"{platform.python_version()} on {platform.system()}, wildgs {version}")
+
+
+def _torch() -> Check:
+    import torch
+
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU only"
+    return Check("PyTorch", "works", f"{torch.__version__}, {torch.get_num_threads()} threads, {device}")
+
+
+def _cpu() -> Check:
+    import torch
+
+    features = [torch.backends.cpu.get_cpu_capability()]
+    for name in ("avx512_bf16", "amx_tile"):
+        probe = getattr(torch.cpu, f"_is_{name}_supported", None)
+        if probe is not None and probe():
+            features.append(name)
+    return Check("CPU", "works", f"{_cpu_model()}, {os.cpu_count()} cores, {', '.join(features)}")
+
+
+def _cpu_model() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _numba() -> Check:
+    """Compiles and runs a kernel, and compares."""
+    import numba
+    import torch
+
+    from wildgs.losses.ssim import ssim
+    from wildgs.threads import thread_count
+
+    picture = torch.linspace(0, 1, 16 * 16 * 3).view(16, 16, 3)
+    value = float(ssim(picture, picture))
+    if abs(value - 1) > 1e-4:
+        detail = f"{numba.__version__} computes {value} where 1 is right"
+        return Check("Numba", "broken", detail, _pip("numba", "-U"))
+    cores = f"kernels run on {thread_count()} threads (WILDGS_NUM_THREADS sets another number)"
+    return Check("Numba", "works", f"{numba.__version__}, {cores}")
+
+
+def _cpu_rasterizer() -> Check:
+    return _rasterize_one("rasteriser on the CPU", "cpu")
+
+
+def _cuda_rasterizer() -> Check:
+    import torch
+
+    name = "rasteriser on CUDA"
+    if not torch.cuda.is_available():
+        detail = "torch sees no NVIDIA GPU; everything runs on the CPU, only slower"
+        if torch.version.cuda is None and shutil.which("nvidia-smi"):
+            detail = "this build of torch has no CUDA, though the machine has an NVIDIA driver"
+            return Check(name, "missing", detail, _pip("torch", "-U --force-reinstall"))
+        return Check(name, "missing", detail)
+    return _gsplat(name)
+
+
+def _gsplat(name: str) -> Check:
+    """Whether gsplat fits, and whether its CUDA extension is built or can be; builds nothing."""
+    from wildgs.errors import UserError
+    from wildgs.rasterize import gsplat_library
+
+    try:
+        gsplat_library.import_gsplat()
+    except UserError as error:
+        state = "missing" if importlib.util.find_spec("gsplat") is None else "broken"
+        return Check(name, state, str(error), _pip(f"'{gsplat_library.REQUIREMENT}'"))
+    if gsplat_library.is_built():
+        return _rasterize_one(name, "cuda")
+    problem = gsplat_library.toolkit_problem()
+    if problem is not None:
+        return Check(name, "broken", f"{problem}: {gsplat_library.build_help()}")
+    detail = "gsplat's CUDA extension is not built yet; the first use builds it, which takes 2 to 15 minutes"
+    return Check(name, "missing", detail, f"{sys.executable} -m wildgs doctor --build-gsplat")
+
+
+def build_gsplat() -> None:
+    """Builds gsplat's CUDA extension, or loads it where it is built.
+
+    Raises:
+        UserError: It cannot be built here.
+    """
+    from wildgs.errors import UserError
+    from wildgs.rasterize import gsplat_library
+
+    gsplat_library.import_gsplat()
+    problem = None if gsplat_library.is_built() else gsplat_library.toolkit_problem()
+    if problem is not None:
+        raise UserError(f"{problem}: {gsplat_library.build_help()}")
+    gsplat_library.load_gsplat()
+
+
+def _rasterize_one(name: str, device: str) -> Check:
+    """Renders one Gaussian in the middle of a picture and looks at it."""
+    import torch
+
+    from wildgs.geometry.camera import Camera
+    from wildgs.rasterize import blend, project
+
+    K = torch.tensor([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, 32, 32).to(device)
+    means = torch.tensor([[0.0, 0.0, 2.0]], device=device)
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
+    ones = torch.ones(1, 3, device=device)
+    projection = project(means, quats, 0.2 * ones, 0.9 * ones[:, 0], camera)
+    alpha = float(blend(projection, ones).alpha[16, 16])
+    if not 0.85 < alpha < 0.95:
+        return Check(name, "broken", f"a Gaussian of opacity 0.9 comes out as {alpha:.2f}")
+    return Check(name, "works", "rendered a test picture")
+
+
+def _pycolmap() -> Check:
+    import pycolmap
+
+    name = "poses from photos"
+    cuda = "with CUDA" if getattr(pycolmap, "has_cuda", False) else "on the CPU"
+    return Check(name, "works", f"pycolmap {pycolmap.__version__}, {cuda}")
+
+
+def _encoder_weights() -> Check:
+    from wildgs.model.encoder import RESNET18
+
+    return _hub_weights("encoder weights", RESNET18, "masks and embeddings start from scratch and are weaker")
+
+
+def _depth_weights() -> Check:
+    from wildgs.priors.depth import DEPTH_ANYTHING
+
+    return _hub_weights("depth weights", DEPTH_ANYTHING, "scenes without depth/ train without the depth loss")
+
+
+def _hub_weights(name: str, repository: str, loss: str) -> Check:
+    """Whether a model lies in the Hugging Face cache; the hub is not asked."""
+    from huggingface_hub import try_to_load_from_cache
+
+    # Other files of weights are pickles, which can run code.
+    if isinstance(try_to_load_from_cache(repository, "model.safetensors"), str):
+        return Check(name, "works", f"{repository} is cached")
+    detail = f"{repository} is not cached; it is fetched when first needed, and where that fails {loss}"
+    return Check(name, "missing", detail, f"hf download {repository}")
+
+
+def _lpips() -> Check:
+    from wildgs.evaluation.lpips_weights import find_lpips, how_to_get_lpips, load_lpips
+
+    name = "LPIPS weights"
+    if find_lpips() is None:
+        detail = "not at hand; fetched by the first `wildgs eval`, and where that fails LPIPS is null"
+        return Check(name, "missing", detail, how_to_get_lpips())
+    model, note = load_lpips(download=False)
+    return Check(name, "works" if model is not None else "broken", note)
+
+
+def _viewer() -> Check:
+    if importlib.util.find_spec("viser") is None:
+        return Check("viewer", "missing", "`wildgs view` needs viser", _pip("viser"))
+    return Check("viewer", "works", f"viser {importlib.metadata.version('viser')}")
+
+
+def _videos() -> Check:
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        detail = "`wildgs render` writes PNG frames only; videos need imageio-ffmpeg"
+        return Check("videos", "missing", detail, _pip("imageio-ffmpeg"))
+    import imageio_ffmpeg
+
+    return Check("videos", "works", f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}")
+
+
+def _pip(package: str, options: str = "") -> str:
+    return " ".join(part for part in (sys.executable, "-m pip install", options, package) if part)

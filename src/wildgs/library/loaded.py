@@ -1,0 +1,160 @@
+"""The Python API: one trained scene, any light, any camera.
+
+scene = wildgs.load("runs/gate")
+look = scene.appearance("evening.jpg")
+image = scene.render(scene.views[0].camera, look)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from wildgs.errors import UserError
+from wildgs.evaluation.metrics import to_8bit
+from wildgs.geometry.camera import Camera
+from wildgs.light.look import Look
+from wildgs.light.sources import LightSources
+from wildgs.light.timeline import Timeline
+from wildgs.model.gaussians import Gaussians
+from wildgs.progress import Progress
+from wildgs.rasterize import blend, sh_to_colors
+from wildgs.runs import Run, load_run
+from wildgs.scene import Scene, View
+from wildgs.scene.trajectories import make_path
+
+LANDMARK_FILE = "landmarks.safetensors"
+"""In the run folder: what new photos are localised against, made when the first one comes."""
+
+
+class LoadedScene:
+    """A trained run, ready to be looked at.
+
+    Attributes:
+        run: The run: its configuration, trained method and alignment.
+    """
+
+    def __init__(self, run: Run) -> None:
+        """Sets up a `LoadedScene`; `load` is the usual way."""
+        self.run = run
+        self._sources = LightSources(run.method, lambda: self.scene, run.folder / LANDMARK_FILE)
+
+    @property
+    def scene(self) -> Scene:
+        """The photo collection as the run folder carries it, see `Run.scene`; photos are decoded as needed."""
+        return self.run.scene
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The scene's photos with their cameras."""
+        return self.scene.views
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians, in the scene's aligned frame (+z up, the photos' usual depth is 1)."""
+        return self.run.method.gaussians
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the run knows more than one light; plain 3DGS does not."""
+        return self.run.config.method != "3dgs"
+
+    def appearance(
+        self, spec: str | Path | Look, *, like: str | None = None, progress: Progress | None = None
+    ) -> Look:
+        """The light of a photo or anything else that can lend one.
+
+        A run of plain 3DGS has one look, its own, which every call gives.
+
+        Args:
+            spec: A photo of the scene by name (with or without its ending); the path of a new photo of the place;
+                the path of any picture; `"neutral"` for the mean over the training photos; the path of a saved
+                appearance (`*.safetensors`); or a look, which is given back.
+            like: For a file: the photo of the scene whose camera and depth it borrows, or `"auto"` for the
+                training photo that looks most like it.
+            progress: Called with (what is being done, how much of it is done, of how much) during long work.
+
+        Raises:
+            UserError: There is no such photo or file, or it cannot be used.
+        """
+        return spec if isinstance(spec, Look) else self._sources.find(spec, like=like, progress=progress)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, look: Look) -> UInt8[Tensor, "H W 3"]:
+        """A picture, in main memory; plain 3D Gaussian Splatting once the look is shaded.
+
+        Args:
+            camera: In the scene's aligned frame, as `views` have theirs.
+            look: From `appearance` or `mix`.
+
+        Raises:
+            UserError: The look belongs to another run.
+        """
+        method = self.run.method
+        if look.method is not method:
+            raise UserError(f"the appearance {look.name!r} belongs to another run; get it from this one")
+        camera = camera.to(self.gaussians.means.device)
+        projection = self.gaussians.project(camera)
+        colors = sh_to_colors(
+            self.gaussians.means, look.sh, camera, degree=method.sh_degree, visible=projection.visible
+        )
+        return to_8bit(blend(projection, colors, depth=False).colors).cpu()
+
+    def frames(
+        self, cameras: Sequence[Camera], looks: Look | Sequence[Look]
+    ) -> Iterator[UInt8[Tensor, "H W 3"]]:
+        """Pictures along a trajectory, rendered as they are asked for.
+
+        Args:
+            cameras: From `path`, or any others in the scene's aligned frame.
+            looks: One, or several between which the light changes evenly from the first frame to the last.
+        """
+        timeline = Timeline.of(looks)
+        last = max(len(cameras) - 1, 1)
+        for number, camera in enumerate(cameras):
+            yield self.render(camera, timeline.at(number / last))
+
+    def path(
+        self,
+        kind: str | Path,
+        *,
+        frames: int = 150,
+        size: tuple[int, int] | None = None,
+        views: Sequence[str] = (),
+    ) -> list[Camera]:
+        """Cameras of a video, in the scene's aligned frame.
+
+        Args:
+            kind: `orbit`, `training` (past the places of the photos), `spiral`, `views` (through the photos named),
+                `still` (the photo named), or the path of a camera file (docs/cameras.md; also nerfstudio's).
+            frames: How many; a camera file has its own number.
+            size: Width and height of the pictures; None takes the photos' usual size, or the photo's or file's.
+            views: Names of photos, for `views` and `still`.
+
+        Raises:
+            UserError: There is no such path or photo, or the file cannot be read.
+        """
+        return make_path(self.scene, kind, frames=frames, size=size, views=views)
+
+    @torch.no_grad()
+    def depth(self, camera: Camera) -> Float[Tensor, "H W"]:
+        """Expected depth along the camera's z axis, world units, in main memory; 0 where nothing is."""
+        projection = self.gaussians.project(camera.to(self.gaussians.means.device))
+        return blend(projection, None).depth.cpu()
+
+
+def load(run: str | Path, device: torch.device | str | None = None) -> LoadedScene:
+    """Opens a trained run.
+
+    Args:
+        run: The run folder.
+        device: Where to render; None takes CUDA where torch has it.
+
+    Raises:
+        UserError: The folder holds no run, or no checkpoint yet.
+    """
+    return LoadedScene(load_run(Path(run), None if device is None else torch.device(device)))

@@ -1,0 +1,201 @@
+"""`wildgs.run`: a folder of photos becomes a scored scene with pages to look at."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.engine.config import DensityConfig, TrainConfig
+from wildgs.engine.trainer import Observer
+from wildgs.errors import UserError
+from wildgs.library.collection import compare_collection, photo_files, record_collection
+from wildgs.library.evaluation import Scores, evaluate
+from wildgs.library.logs import logger
+from wildgs.library.showcase import write_showcase
+from wildgs.library.training import read_scene, train
+from wildgs.library.webpage import write_scene_page
+from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
+from wildgs.progress import Progress, counter, silent
+from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
+from wildgs.scene.config import DataConfig
+from wildgs.scene.images import UnreadableImageError, open_image
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.reconstruction import reconstruct
+
+CPU_STEPS, GPU_STEPS = 3000, 30_000
+CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
+CPU_MAX_GAUSSIANS = 80_000
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What `run` and `demo` leave.
+
+    Attributes:
+        folder: The run folder, or the demo's folder.
+        scores: By the name of a run; empty where no photo is held out.
+        report: The page with scores and comparisons.
+        page: The page that carries the scene.
+    """
+
+    folder: Path
+    scores: dict[str, Scores]
+    report: Path
+    page: Path
+
+
+def run(
+    photos: str | Path,
+    output: str | Path,
+    *,
+    steps: int | None = None,
+    downscale: float | None = None,
+    max_gaussians: int | None = None,
+    holdout: int = 8,
+    sfm: SfmConfig | None = None,
+    execution: ExecutionConfig | None = None,
+    progress: Progress | None = None,
+    observers: Sequence[Observer] = (),
+) -> FinishedRun:
+    """Poses, trains, scores and shows a folder of photos; stages that are done already are not done again.
+
+    Args:
+        photos: Folder of photos.
+        output: Run folder; the posed scene goes to OUTPUT/scene.
+        steps: Training steps; by default 30,000 on a GPU and 3,000 on a CPU.
+        downscale: Divides the photos' width and height; by default to at most 1,600 pixels on a GPU, 400 on a CPU.
+        max_gaussians: Upper bound on the number of Gaussians; by default it follows the machine.
+        holdout: Every n-th photo is held out for scoring; 0 for none.
+        sfm: Options of structure from motion.
+        execution: How it is executed.
+        progress: Called during all stages.
+        observers: Called with a `StepReport` after every training step.
+
+    Raises:
+        UserError: The photos cannot be used, or are others than those that OUTPUT was made from; another process
+            works on OUTPUT.
+    """
+    photos, output, progress = Path(photos), Path(output), progress or silent
+    photo_files(photos)  # a wrong folder is said before anything is written
+    with lock_run(output):
+        scene_folder = output / "scene"
+        _pose(photos, scene_folder, sfm, progress)
+        if not (output / CONFIG_FILE).is_file():
+            _estimate_depth_if_possible(scene_folder, progress)
+        config = _configure(scene_folder, steps, downscale, max_gaussians, holdout)
+        scene = read_scene(config, execution or ExecutionConfig(), progress)
+        train(
+            scene,
+            config,
+            output=output,
+            execution=execution,
+            resume="auto",
+            progress=progress,
+            observers=observers,
+            locked=True,
+        )
+        loaded = load_run(output)
+        scores = evaluate(loaded, scene=scene, progress=progress) if scene.test_views else {}
+        title = photos.resolve().name
+        report, page = output / "report.html", output / "scene.html"
+        summary = f"{len(scene.views)} photos from {title}, {loaded.step} steps of Wild-GS."
+        write_showcase(report, title, summary, scene, [("Wild-GS", loaded, scores)])
+        write_scene_page(loaded, page, title, progress)
+    return FinishedRun(output, {str(output): scores} if scores else {}, report, page)
+
+
+def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) -> None:
+    """Structure from motion, or a check that the poses that are there were made from these photos.
+
+    Raises:
+        UserError: They were not.
+    """
+    if not (scene / "sparse" / "0").is_dir():
+        report = reconstruct(photos, scene, sfm, progress=progress)
+        record_collection(photos, scene)
+        for line in report.lines():
+            logger.info("%s", line)
+        return
+    changes = compare_collection(photos, scene)
+    if changes:
+        raise UserError(
+            f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or "
+            f"delete {scene.parent} to start again with these photos"
+        )
+    logger.info("%s has poses of these photos already; going on with them", scene)
+
+
+@dataclass(frozen=True)
+class EstimatedDepth:
+    """What `estimate_depth` did.
+
+    Attributes:
+        folder: SCENE/depth.
+        written: Photos estimated.
+        kept: Photos that had an estimate before.
+    """
+
+    folder: Path
+    written: int
+    kept: int
+
+
+def estimate_depth(
+    scene: str | Path,
+    *,
+    model: str = DEPTH_ANYTHING,
+    overwrite: bool = False,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> EstimatedDepth:
+    """Estimates the disparity of every photo of a scene, written to SCENE/depth/ as 16-bit pictures.
+
+    Args:
+        scene: Folder of a COLMAP scene.
+        model: Folder of the network in the hub's layout, or its name on the hub.
+        overwrite: Estimate again what is already there.
+        device: `cpu` or `cuda`; by default CUDA where there is one.
+        progress: Called for every photo.
+
+    Raises:
+        UserError: There is no such scene, or the network cannot be had.
+    """
+    scene = Path(scene)
+    if not scene.is_dir():
+        raise UserError(f"{scene}: no such folder; give the folder of a COLMAP scene")
+    estimator = load_depth_anything(model, device=device, required=True)
+    assert estimator is not None  # `required` raises otherwise
+    show = counter(progress, "estimating depth")
+    written, kept = fill_depth_folder(scene, estimator, overwrite=overwrite, progress=show)
+    return EstimatedDepth(scene / "depth", written, kept)
+
+
+def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
+    """Fills what is missing in the scene's depth folder; warns and goes on where the network cannot be had."""
+    estimator = load_depth_anything()
+    if estimator is not None:
+        fill_depth_folder(scene, estimator, progress=counter(progress, "estimating depth"))
+
+
+def _configure(
+    scene: Path, steps: int | None, downscale: float | None, max_gaussians: int | None, holdout: int
+) -> RunConfig:
+    """Steps and size that suit the machine."""
+    gpu = default_device().type == "cuda"
+    steps = steps or (GPU_STEPS if gpu else CPU_STEPS)
+    downscale = downscale or _downscale_for(scene, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE)
+    most = max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
+    train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=most))
+    return RunConfig(scene.resolve(), data=DataConfig(downscale=downscale, holdout=holdout), train=train)
+
+
+def _downscale_for(folder: Path, long_side: int) -> float:
+    """The factor that brings the largest photo to `long_side` pixels; 1 where it is smaller."""
+    sizes = [1]
+    for path in photo_files(folder / "images").values():
+        with contextlib.suppress(UnreadableImageError), open_image(path) as image:
+            sizes.append(max(image.size))
+    return max(1.0, round(max(sizes) / long_side, 2))

@@ -1,0 +1,186 @@
+"""`wildgs.render`: pictures of a run from the photos' viewpoints, or a video along a path, in any light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wildgs.errors import UserError
+from wildgs.evaluation.pictures import picture_paths, write_picture
+from wildgs.exporters.video import check_output, is_video, write_frames
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.trajectory import still
+from wildgs.library.config import MixOptions, TrajectoryOptions
+from wildgs.library.loaded import LoadedScene
+from wildgs.library.looks import find_looks, loaded
+from wildgs.light.look import NEUTRAL, Look
+from wildgs.progress import Progress, counter
+from wildgs.scene import find_view
+from wildgs.scene.trajectories import AROUND, THROUGH, read_path
+
+DEFAULT_PATH = "orbit"
+DEFAULT_FPS = 30.0
+MAX_FRAMES = 100_000
+MAX_SIDE, MAX_PIXELS = 16_384, 2**27
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+Spec = str | Path | Look
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What was rendered.
+
+    Attributes:
+        output: The file or folder.
+        pictures: How many pictures or frames.
+        size: Width and height of the last one.
+        fps: Frames per second of a video; None for stills.
+        looks: The appearances.
+    """
+
+    output: Path
+    pictures: int
+    size: tuple[int, int]
+    fps: float | None
+    looks: tuple[Look, ...]
+
+
+def render(
+    run: str | Path | LoadedScene,
+    output: str | Path,
+    *,
+    appearance: Sequence[Spec] = (NEUTRAL,),
+    to: Sequence[Spec] = (),
+    views: Sequence[str] = (),
+    trajectory: TrajectoryOptions | None = None,
+    mixing: MixOptions | None = None,
+    progress: Progress | None = None,
+) -> Rendered:
+    """Renders stills, or a video.
+
+    Args:
+        run: A run folder, or a loaded scene.
+        output: A video (.mp4, .mkv, .mov), a picture (.png, .jpg) of one view in one light, or a folder: of frames
+            where there is a path, else of OUTPUT/<appearance>/<view>.png.
+        appearance: What `LoadedScene.appearance` takes.
+        to: Appearances to which the light changes during a video, one after the other.
+        views: Photos whose viewpoint is rendered, by name; by default the held-out photos, or all where none is.
+        trajectory: Path, length and size.
+        mixing: How appearances are found and mixed.
+        progress: Called for every picture.
+
+    Raises:
+        UserError: Something that was named does not exist, or cannot be rendered or written.
+    """
+    output, trajectory = Path(output), trajectory or TrajectoryOptions()
+    if trajectory.size is not None:
+        check_size(*trajectory.size)
+    if trajectory.path is None and not is_video(output):
+        if to:
+            raise UserError("--to changes light over time: add --path, or name a video as --output")
+        return _render_views(loaded(run), output, appearance, views, trajectory.size, mixing, progress)
+    check_output(output)
+    scene = loaded(run)
+    cameras, fps = _find_cameras(scene, trajectory, views)
+    looks = find_looks(scene, appearance, mixing, progress=progress)
+    like = MixOptions(like=mixing.like if mixing else None)
+    looks += find_looks(scene, to, like, progress=progress)
+    if is_video(output):
+        cameras = [_even(camera) for camera in cameras]
+    size = (cameras[0].width, cameras[0].height)
+    write_frames(output, _frames(scene, cameras, looks, progress), size, fps)
+    return Rendered(output, len(cameras), size, fps, tuple(looks))
+
+
+def check_size(width: int, height: int) -> None:
+    """Refuses sizes that are no picture, or more than memory should be asked for.
+
+    Raises:
+        UserError: The size is one of those.
+    """
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise UserError(
+            f"--size {width} {height}: sides must be from 1 to {MAX_SIDE:,} pixels, and the picture at most "
+            f"{MAX_PIXELS / 1e6:.0f} megapixels"
+        )
+
+
+def _render_views(
+    scene: LoadedScene,
+    output: Path,
+    appearance: Sequence[Spec],
+    names: Sequence[str],
+    size: tuple[int, int] | None,
+    mixing: MixOptions | None,
+    progress: Progress | None,
+) -> Rendered:
+    """Every view under every appearance."""
+    single = output.suffix.lower() in PICTURE_SUFFIXES
+    if not single:
+        check_output(output)
+        if output.is_file():
+            raise UserError(f"{output} is a file; give a folder for the pictures")
+    collection = scene.scene
+    views = [find_view(collection, name) for name in names] or collection.test_views or collection.train_views
+    if not views:
+        raise UserError(f"{collection.root} has no photo with a camera")
+    looks = find_looks(scene, appearance, mixing, progress=progress)
+    if single:
+        views = views if names else views[:1]
+        if len(views) * len(looks) != 1:
+            raise UserError(f"{output} holds one picture; give one --view and one --appearance, or a folder")
+    cameras = [view.camera if size is None else still(view.camera, 1, *size)[0] for view in views]
+    paths = picture_paths([view.name for view in views])
+    folders = picture_paths([look.name for look in looks])
+    show = counter(progress, "rendering")
+    for number, look in enumerate(looks):
+        folder = output / folders[look.name].with_suffix("")
+        for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+            write_picture(output if single else folder / paths[view.name], scene.render(camera, look))
+            show(number * len(views) + index + 1, len(views) * len(looks))
+    shape = (cameras[-1].width, cameras[-1].height)
+    return Rendered(output, len(views) * len(looks), shape, None, tuple(looks))
+
+
+def _find_cameras(
+    scene: LoadedScene, trajectory: TrajectoryOptions, views: Sequence[str]
+) -> tuple[list[Camera], float]:
+    """The video's cameras and its frames per second.
+
+    Raises:
+        UserError: The path cannot be had, or is too short or too long.
+    """
+    kind = trajectory.path or ("views" if len(views) > 1 else DEFAULT_PATH)
+    fps = trajectory.fps or DEFAULT_FPS
+    if kind not in (*AROUND, *THROUGH) and Path(kind).suffix and trajectory.size is None:
+        cameras, file_fps = read_path(scene.scene, Path(kind))
+        sizes = {(camera.width, camera.height) for camera in cameras}
+        if len(sizes) > 1:
+            raise UserError(f"{kind}: the pictures of a video must be of one size")
+        return cameras, trajectory.fps or file_fps
+    seconds = trajectory.seconds
+    if not (fps > 0 and seconds > 0 and seconds * fps <= MAX_FRAMES):
+        raise UserError(
+            f"{seconds:g} seconds at {fps:g} frames per second: both must be above 0, and the video at most "
+            f"{MAX_FRAMES:,} frames long"
+        )
+    frames = max(1, round(seconds * fps))
+    return scene.path(kind, frames=frames, size=trajectory.size, views=views), fps
+
+
+def _even(camera: Camera) -> Camera:
+    """The camera without the last odd column and row, which H.264 cannot have."""
+    return camera.cropped(0, 0, max(2, camera.width // 2 * 2), max(2, camera.height // 2 * 2))
+
+
+def _frames(
+    scene: LoadedScene, cameras: Sequence[Camera], looks: Sequence[Look], progress: Progress | None
+) -> Iterator[np.ndarray]:
+    show = counter(progress, "rendering")
+    for number, picture in enumerate(scene.frames(cameras, looks), start=1):
+        yield picture.numpy()
+        show(number, len(cameras))

@@ -1,0 +1,351 @@
+"""`wildgs.train`: a scene with poses becomes a trained run; memory, records, checkpoints and signals around it."""
+
+from __future__ import annotations
+
+import gc
+import tempfile
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from wildgs import features
+from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
+from wildgs.engine.autosave import Autosave
+from wildgs.engine.checkpoint_writer import CheckpointWriter
+from wildgs.engine.memory import plan_budget
+from wildgs.engine.recorder import Recorder
+from wildgs.engine.team import Team
+from wildgs.engine.trainer import Observer, StepReport, Trainer
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
+from wildgs.library.logs import logger, run_log
+from wildgs.progress import Progress, counter, silent
+from wildgs.runs import (
+    CHECKPOINT_FOLDER,
+    CONFIG_FILE,
+    default_device,
+    lock_run,
+    prepare_training,
+    refuse_trained,
+    run_state,
+    save_run,
+)
+from wildgs.scene import Scene, load_scene
+
+LEAST_SECONDS_ON_CUDA = 60.0
+"""Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
+RETRY_SHARE = 0.8
+"""Share of the Gaussians with which memory ran out that the second try may have."""
+BUDGET = "train.density.max_gaussians"
+"""The one entry that may change when a run is resumed: it depends on the machine's memory."""
+
+Attachment = Callable[[Trainer, Scene], AbstractContextManager[Observer]]
+"""Opens an observer for one training, as a viewer is; closed when the training ends or fails."""
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """What a training left.
+
+    Attributes:
+        folder: The run folder.
+        config: Its configuration.
+        steps: Steps done.
+        seconds: Training time, without reading photos and saving.
+        num_gaussians: N at the end.
+        device: Where it was trained.
+    """
+
+    folder: Path
+    config: RunConfig
+    steps: int
+    seconds: float
+    num_gaussians: int
+    device: str
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What stays the same when a training is tried again."""
+
+    folder: Path
+    scene: Scene
+    execution: ExecutionConfig
+    team: Team
+    progress: Progress
+    observers: Sequence[Observer]
+    attach: Sequence[Attachment]
+
+
+def train(
+    scene: str | Path | Scene,
+    config: RunConfig | None = None,
+    *,
+    output: str | Path,
+    execution: ExecutionConfig | None = None,
+    resume: bool | Literal["auto"] = False,
+    max_gaussians: int | None = None,
+    progress: Progress | None = None,
+    observers: Sequence[Observer] = (),
+    attach: Sequence[Attachment] = (),
+    team: Team | None = None,
+    locked: bool = False,
+) -> TrainedRun:
+    """Trains a run to its end.
+
+    The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. Where a GPU's memory runs
+    out, training goes on once from the newest checkpoint with fewer Gaussians.
+
+    Args:
+        scene: A scene folder, or a scene read from one.
+        config: What decides the outcome; the defaults where None, or the run's own on resuming.
+        output: The run folder.
+        execution: How it is executed; without influence on the outcome.
+        resume: Go on from the newest checkpoint; "auto" does so where the folder holds a run.
+        max_gaussians: A bound on the number of Gaussians that is refused, not lowered, where memory is short.
+        progress: Called for every photo read and for every step.
+        observers: Called with a `StepReport` after every step.
+        attach: Openers of further observers, which are closed when training ends.
+        team: The processes that train together; by default this one alone.
+        locked: Whether the caller holds the run folder's lock.
+
+    Raises:
+        UserError: The scene cannot be used, the folder holds another run, memory or disk do not suffice, or
+            training diverged.
+        InterruptedTrainingError: A signal came; the last step is saved.
+    """
+    folder, execution, team = Path(output), execution or ExecutionConfig(), team or Team()
+    progress = progress or silent
+    with ExitStack() as stack:
+        if not locked:
+            team.from_first(lambda: stack.enter_context(lock_run(folder)))
+        if resume == "auto":
+            resume = team.from_first(lambda: (folder / CONFIG_FILE).is_file())
+        if resume:
+            stored = team.from_first(lambda: read_config(folder / CONFIG_FILE))
+            config = _resumed(folder, stored, config)
+        else:
+            team.from_first(lambda: refuse_trained(folder))
+            config = config or RunConfig()
+        if max_gaussians is not None:
+            config = with_budget(config, max_gaussians)
+        if not isinstance(scene, Scene):
+            config = replace(config, scene=Path(scene).resolve())
+        with team.together():
+            read = scene if isinstance(scene, Scene) else read_scene(config, execution, progress)
+        if not resume:
+            with team.together():
+                config = plan_memory(config, read, explicit=max_gaussians is not None)
+            config = with_budget(config, team.least(config.train.density.max_gaussians))
+        job = _Job(folder, read, execution, team, progress, observers, attach)
+        return _train_within_memory(job, config, resume=bool(resume))
+
+
+def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunConfig:
+    """The configuration with which a run goes on.
+
+    Raises:
+        UserError: Another one is asked for than the run began with.
+    """
+    if asked is None:
+        return stored
+    differing = differing_entries(stored, asked)
+    differing.pop(BUDGET, None)
+    if differing:
+        changes = ", ".join(f"{path} is {old}, not {new}" for path, (old, new) in list(differing.items())[:3])
+        raise UserError(
+            f"{folder} holds a run with other settings ({changes}): a run goes on with those it began with; leave "
+            "the options out, or choose another --output for a new run"
+        )
+    return asked
+
+
+def read_scene(config: RunConfig, execution: ExecutionConfig, progress: Progress | None = None) -> Scene:
+    """Reads the scene of a configuration, and logs what is in it."""
+    show = counter(progress, "reading photos")
+    scene = load_scene(config.scene, config.data, image_cache=execution.image_cache, progress=show)
+    logger.info(
+        "%s: %d photos train, %d test, %s points",
+        scene.root,
+        len(scene.train_views),
+        len(scene.test_views),
+        f"{len(scene.points):,}",
+    )
+    return scene
+
+
+def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
+    """The same run with another bound on the number of Gaussians.
+
+    Raises:
+        UserError: The bound is below 1.
+    """
+    if max_gaussians < 1:
+        raise UserError(f"--max-gaussians {max_gaussians}: must be 1 or more")
+    density = replace(config.train.density, max_gaussians=max_gaussians)
+    return replace(config, train=replace(config.train, density=density))
+
+
+def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> RunConfig:
+    """The run with a budget of Gaussians that fits into memory; a warning says where it was lowered.
+
+    Raises:
+        UserError: It cannot fit.
+    """
+    asked = config.train.density.max_gaussians
+    budget, message = plan_budget(config.method, scene, asked, default_device(), explicit=explicit)
+    if message is not None:
+        warnings.warn(message, WildGSWarning, stacklevel=2)
+    return config if budget == asked else with_budget(config, budget)
+
+
+def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> TrainedRun:
+    """Trains to the end; where the GPU's memory runs out, once more from the newest checkpoint with less.
+
+    Raises:
+        UserError: Memory ran out twice.
+    """
+    result = _train_unless_full(job, config, resume)
+    if isinstance(result, TrainedRun):
+        return result
+    gc.collect()
+    torch.cuda.empty_cache()
+    budget = result.train.density.max_gaussians
+    message = (
+        f"the GPU's memory ran out; going on from the newest checkpoint with at most {budget:,} Gaussians"
+    )
+    warnings.warn(message, WildGSWarning, stacklevel=3)
+    again = _train_unless_full(job, result, True)
+    if isinstance(again, TrainedRun):
+        return again
+    raise UserError(
+        "the GPU's memory ran out again: go on with --resume and a lower --max-gaussians, or start anew with a "
+        "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
+    )
+
+
+def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun | RunConfig:
+    """Trains to the end, or returns the configuration to try next.
+
+    What ran out of memory is freed when this returns: nothing else holds the trainer.
+
+    Raises:
+        UserError: Memory ran out on one of several processes: the others cannot be asked to try again.
+    """
+    trainer: Trainer | None = None
+    try:
+        trainer = prepare_training(
+            job.folder,
+            config,
+            job.scene,
+            resume=resume,
+            team=job.team,
+            progress=counter(job.progress, "copying photos to the run"),
+        )
+        trainer.cuda_graphs = job.execution.cuda_graphs
+        with ExitStack() as stack:
+            if job.team.first:
+                observers = [stack.enter_context(open_one(trainer, job.scene)) for open_one in job.attach]
+                return _train_to_end(job, config, trainer, [*job.observers, *observers])
+            return _follow(job, config, trainer)
+    except torch.OutOfMemoryError as error:
+        if job.team.size > 1:
+            raise UserError(
+                "a GPU's memory ran out: go on with --resume and a lower --max-gaussians"
+            ) from error
+        count = len(job.scene.points) if trainer is None else len(trainer.method.gaussians)
+        budget = min(count, config.train.density.max_gaussians)
+        return with_budget(config, max(1, int(RETRY_SHARE * budget)))
+
+
+def _train_to_end(
+    job: _Job, config: RunConfig, trainer: Trainer, observers: Sequence[Observer]
+) -> TrainedRun:
+    """Trains what is left, recording and saving.
+
+    Only whole steps are saved: whatever else breaks off a step leaves the newest checkpoint as it was.
+
+    Raises:
+        InterruptedTrainingError: A signal came; the last step is saved.
+    """
+    team, folder, execution = job.team, job.folder, job.execution
+    label = f"training {config.method}" + (f" on {team.size} processes" if team.size > 1 else "")
+    alignment = job.scene.alignment
+
+    def rescue() -> Path:
+        place = Path(tempfile.mkdtemp(prefix=f"wildgs-{folder.resolve().name}-"))
+        return save_run(place, trainer, config, alignment)
+
+    def show(report: StepReport) -> None:
+        job.progress(label, report.step, config.train.steps)
+
+    on_cuda = trainer.device.type == "cuda"
+    writer = CheckpointWriter(background=on_cuda and features.is_on("checkpoint_thread"))
+    saver = Autosave(
+        lambda: writer.save(folder / CHECKPOINT_FOLDER, *run_state(trainer, config, alignment)),
+        every=execution.checkpoint_every,
+        minutes=execution.checkpoint_minutes,
+        step=trainer.step,
+        rescue=rescue,
+        least_seconds=LEAST_SECONDS_ON_CUDA if on_cuda else 0.0,
+    )
+    with (
+        run_log(folder),
+        Recorder(
+            folder,
+            scalars_every=execution.log_every,
+            pictures_every=execution.pictures_every,
+            step=trainer.step,
+        ) as recorder,
+        StopOnSignal(team) as stop,
+    ):
+        logger.debug("%s from step %d of %d", label, trainer.step, config.train.steps)
+        job.progress(label, trainer.step, config.train.steps)
+        try:
+            trainer.run([recorder, *observers, show, saver, stop])
+        except InterruptedTrainingError as interrupt:
+            team.from_first(lambda: _save_last(saver, writer, trainer.step, hurry=True))
+            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
+            raise
+        _save_last(saver, writer, trainer.step)
+        result = _result(job, config, trainer)
+        logger.info(
+            "%s: %d steps in %.1f min on %s, %s Gaussians -> %s",
+            label,
+            result.steps,
+            result.seconds / 60,
+            result.device,
+            f"{result.num_gaussians:,}",
+            folder,
+        )
+    return result
+
+
+def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:
+    """Saves the last step and returns when it is on the disk; see `Autosave.save_last`."""
+    if not writer.finish():
+        saver.saved_step = 0  # what was being written failed: the last step is to be written again
+    saver.save_last(step, hurry=hurry)
+
+
+def _follow(job: _Job, config: RunConfig, trainer: Trainer) -> TrainedRun:
+    """Trains as a process other than rank 0, which alone writes and reports."""
+    with StopOnSignal(trainer.team) as stop:
+        try:
+            trainer.run([stop])
+        except InterruptedTrainingError:
+            trainer.team.from_first(lambda: None)  # waits until rank 0 has saved
+            raise
+    return _result(job, config, trainer)
+
+
+def _result(job: _Job, config: RunConfig, trainer: Trainer) -> TrainedRun:
+    device = trainer.device
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
+    count = len(trainer.method.gaussians)
+    return TrainedRun(job.folder, config, trainer.step, trainer.seconds, count, name)

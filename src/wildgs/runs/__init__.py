@@ -1,0 +1,345 @@
+"""Run folders: what training leaves and every other verb reads."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import filelock
+import torch
+from torch import Tensor
+
+from wildgs.config import RunConfig, read_config, to_plain, write_config
+from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
+from wildgs.engine.team import Team
+from wildgs.engine.trainer import Trainer
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.model.method import Method
+from wildgs.model.registry import create_method, restore_method
+from wildgs.model.wildgs import ColoredPoints
+from wildgs.priors.depth_points import depth_points
+from wildgs.priors.ground import ground_points
+from wildgs.runs.scenes import CHECKPOINT_FOLDER, adopt_scene, carried_record, require_same_scene
+from wildgs.scene import Alignment, Scene, load_scene
+from wildgs.scene.carried import SCENE_FILE, Progress, carry_scene, read_carried_scene
+from wildgs.scene.scene_record import SceneRecord
+
+CONFIG_FILE = "config.yaml"
+LOCK_FILE = ".lock"
+
+
+def default_device() -> torch.device:
+    """CUDA where torch has it, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained run, as loaded from its folder.
+
+    Attributes:
+        folder: The run folder.
+        config: Its configuration.
+        method: The trained method.
+        step: Steps done.
+        train_seconds: Training time.
+        alignment: From the input's frame to the scene's.
+    """
+
+    folder: Path
+    config: RunConfig
+    method: Method
+    step: int
+    train_seconds: float
+    alignment: Alignment
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene as the run folder carries it: cameras, points, alignment, split, and photos on demand.
+
+        Its photos are copies, as large as their cameras but of no more detail than `CarriedPhotos.detail`: enough
+        to read their light and to show them, not to score against or to train on (`read_scene` is for that). Runs
+        of earlier versions carry no scene; theirs is read from the scene folder.
+
+        Raises:
+            UserError: What the run carries cannot be read; or it carries nothing, and its scene folder is gone.
+        """
+        carried = read_carried_scene(self.folder)
+        if carried is not None:
+            return carried
+        root = self._scene_folder(None)
+        return load_scene(root, self.config.data, alignment=self.alignment, lazy=True)
+
+    def read_scene(self, root: Path | None = None, progress: Progress | None = None) -> Scene:
+        """The scene with its full photos, masks, depth priors and truth, from its folder.
+
+        Cameras, split, points and alignment are the run's own, so that a scene folder that changed since changes no
+        score silently: one warning says what differs.
+
+        Args:
+            root: The scene folder; None takes the one on which the run was trained.
+            progress: Called with (photos read, photos in all).
+
+        Raises:
+            UserError: The folder is missing, cannot be read, or holds another scene.
+        """
+        root = self._scene_folder(root)
+        found = load_scene(root, self.config.data, alignment=self.alignment, progress=progress)
+        if not (self.folder / SCENE_FILE).is_file():
+            return found
+        return adopt_scene(SceneRecord.read(self.folder / SCENE_FILE), found, self.folder)
+
+    def _scene_folder(self, root: Path | None) -> Path:
+        root = root or self.config.scene
+        if not root.is_dir():
+            raise UserError(
+                f"{root}: no such folder; {self.folder} was trained on the photos there: "
+                "give the folder where they are now by --scene"
+            )
+        return root
+
+
+def load_run(folder: Path, device: torch.device | None = None) -> Run:
+    """Loads the newest checkpoint of a run.
+
+    Raises:
+        UserError: The folder holds no run, or no checkpoint yet.
+    """
+    if not (folder / CONFIG_FILE).is_file():
+        raise UserError(
+            f"{folder} is not a run folder (no {CONFIG_FILE}); make one with `wildgs train SCENE`"
+        )
+    config = read_config(folder / CONFIG_FILE)
+    checkpoint = newest_checkpoint(folder)
+    if checkpoint is None:
+        raise UserError(f"{folder} has no checkpoint yet; let `wildgs train` finish or resume it")
+    method = restore_method(config.method, config.model, checkpoint.method)
+    with _complete(folder):
+        return Run(
+            folder=folder,
+            config=config,
+            method=method.to(device or default_device()).eval(),
+            step=int(checkpoint.state["progress.step"]),
+            train_seconds=float(checkpoint.state["progress.seconds"]),
+            alignment=Alignment.from_dict(checkpoint.header["alignment"]),
+        )
+
+
+@contextmanager
+def _complete(folder: Path) -> Iterator[None]:
+    """Entries that a checkpoint lacks are a user's mistake: a file of another program, or another version."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        first = (str(error).splitlines() or [""])[0]
+        raise UserError(
+            f"{folder}: its checkpoint is not one of this version's training ({type(error).__name__}: {first})"
+        ) from error
+
+
+@contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """Keeps other trainings out of a run folder while the block runs; the lock dies with the process.
+
+    Raises:
+        UserError: Another process trains into it, or it cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / LOCK_FILE, timeout=0)
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise UserError(
+            f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
+        ) from error
+    except NotImplementedError:  # so filelock calls a disk that has no locks, as some network disks
+        warnings.warn(
+            f"{folder} lies on a disk without locks: nothing keeps a second training out of it",
+            WildGSWarning,
+            stacklevel=3,
+        )
+        yield
+        return
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
+    """The newest checkpoint of a run folder that is whole, or None; see `load_newest`."""
+    return load_newest(folder / CHECKPOINT_FOLDER, set_aside=set_aside)
+
+
+def refuse_trained(folder: Path) -> None:
+    """Protects a run from being trained over.
+
+    Raises:
+        UserError: The folder already holds one.
+    """
+    if list_checkpoints(folder / CHECKPOINT_FOLDER):
+        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+
+
+def prepare_training(
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    *,
+    resume: bool,
+    team: Team | None = None,
+    progress: Progress | None = None,
+) -> Trainer:
+    """A trainer at step 0, or at the newest whole checkpoint of a run that may have a lower budget now.
+
+    Of several processes, rank 0 alone reads and writes the run folder.
+
+    Args:
+        folder: The run folder.
+        config: Of the run.
+        scene: What is trained on.
+        resume: Whether to go on with a run.
+        team: The processes that train together.
+        progress: Called with (photos, photos in all) while the run folder gets its copies of the photos.
+
+    Raises:
+        UserError: As `start_training` and `resume_training` do.
+    """
+    if not resume:
+        return start_training(folder, config, scene, team=team, progress=progress)
+    team = team or Team()
+    team.from_first(lambda: require_same_scene(folder, scene))
+    stored = team.from_first(lambda: read_config(folder / CONFIG_FILE))
+    if to_plain(config) != to_plain(stored):  # the scene may have moved
+        team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
+    trainer = resume_training(folder, scene, team=team, progress=progress)
+    if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
+        # Saved at once, so that a run killed from here on goes on from this very state.
+        team.from_first(lambda: save_run(folder, trainer, config, scene.alignment))
+    return trainer
+
+
+def start_training(
+    folder: Path,
+    config: RunConfig,
+    scene: Scene,
+    device: torch.device | None = None,
+    team: Team | None = None,
+    progress: Progress | None = None,
+) -> Trainer:
+    """A trainer at step 0; writes the run's configuration and what the run carries of its scene.
+
+    Raises:
+        UserError: The folder already holds a trained run.
+    """
+    team = team or Team()
+    team.from_first(lambda: _claim(folder, config, scene, progress))
+    device = device or default_device()
+    # The trainer keeps the generators' states; the process gets its own back.
+    with team.together(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(config.train.seed)
+        points, colors = _within_budget(scene, config)
+        dense = ground = None
+        if config.method == "wildgs":
+            dense = _dense_points(scene, config, len(points))
+            ground = _ground_points(scene, config, (points, colors), dense)
+        method = create_method(config.method, config.model, points, colors, dense, ground)
+        return Trainer(method.to(device), scene, config.train, team)
+
+
+def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Progress | None) -> None:
+    refuse_trained(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_config(folder / CONFIG_FILE, config)
+    carry_scene(folder, scene, progress)
+
+
+def _dense_points(scene: Scene, config: RunConfig, sparse: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points from depth priors."""
+    wanted = config.model.depth_points
+    allowed = min(wanted.points, _half_of_the_room(config, sparse))
+    return depth_points(scene, replace(wanted, points=allowed), config.train.seed)
+
+
+def _ground_points(
+    scene: Scene, config: RunConfig, sparse: ColoredPoints, dense: ColoredPoints
+) -> ColoredPoints:
+    """Where the ground goes on."""
+    points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
+    wanted = config.model.ground
+    allowed = min(wanted.points, _half_of_the_room(config, len(points)))
+    centers = torch.stack([view.camera.position for view in scene.train_views])
+    return ground_points(points, colors, centers, replace(wanted, points=allowed), config.train.seed)
+
+
+def _half_of_the_room(config: RunConfig, taken: int) -> int:
+    """Half of the Gaussians that the budget leaves beside the sky's and `taken`: growth needs the rest."""
+    return max(0, config.train.density.max_gaussians - taken - config.model.sky.points) // 2
+
+
+def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """The scene's points, or a random choice of them where they are more than the budget."""
+    count, budget = len(scene.points), config.train.density.max_gaussians
+    if count <= budget:
+        return scene.points, scene.point_colors
+    warnings.warn(
+        f"the scene has {count:,} points; training starts from {budget:,} of them (--max-gaussians)",
+        WildGSWarning,
+        stacklevel=3,
+    )
+    generator = torch.Generator().manual_seed(config.train.seed)
+    chosen = torch.randperm(count, generator=generator)[:budget].sort().values
+    return scene.points[chosen], scene.point_colors[chosen]
+
+
+def resume_training(
+    folder: Path,
+    scene: Scene,
+    device: torch.device | None = None,
+    team: Team | None = None,
+    progress: Progress | None = None,
+) -> Trainer:
+    """A trainer at the newest undamaged checkpoint, with the configuration that the run began with.
+
+    A run that was killed before its first checkpoint starts at step 0 again. Cameras, split, points and alignment
+    are those that the run carries; a run of an earlier version carries them from now on.
+
+    Raises:
+        UserError: The folder holds no run, all checkpoints are damaged, or the run is of another scene.
+    """
+    team = team or Team()
+    config = team.from_first(lambda: read_config(folder / CONFIG_FILE))
+    checkpoint = team.from_first(lambda: newest_checkpoint(folder, set_aside=True))
+    if checkpoint is None:
+        return start_training(folder, config, scene, device, team, progress)
+    record = team.from_first(lambda: carried_record(folder, scene, progress))
+    with team.together(), _complete(folder):
+        method = restore_method(config.method, config.model, checkpoint.method)
+        scene = adopt_scene(record, scene, folder)
+        trainer = Trainer(method.to(device or default_device()), scene, config.train, team)
+        trainer.restore(checkpoint.state)
+    return trainer
+
+
+def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Alignment) -> Path:
+    """Writes a checkpoint from which training can go on and every other verb can read.
+
+    Raises:
+        UserError: It cannot be written.
+    """
+    return save_checkpoint(folder / CHECKPOINT_FOLDER, *run_state(trainer, config, alignment))
+
+
+def run_state(
+    trainer: Trainer, config: RunConfig, alignment: Alignment
+) -> tuple[int, dict[str, Tensor], dict[str, Any]]:
+    """What a checkpoint of a run holds: step, tensors and header."""
+    header: dict[str, Any] = {"config": to_plain(config), "alignment": alignment.to_dict()}
+    return trainer.step, trainer.state(), header

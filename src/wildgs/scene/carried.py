@@ -1,0 +1,172 @@
+"""A scene as a run folder carries it, so that the run works without the scene folder.
+
+`scene.safetensors` holds cameras, split, alignment, points and their observations. `lights/` holds each photo, made
+smaller where it is large, and its mask: what the photo's appearance is read from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from wildgs.errors import UserError
+from wildgs.files import written_aside
+from wildgs.scene.image_cache import DECODERS, ImageCache
+from wildgs.scene.images import Photo, UnreadableImageError, read_mask, read_photo
+from wildgs.scene.photo_store import PhotoStore
+from wildgs.scene.scene import Scene, View
+from wildgs.scene.scene_record import SceneRecord
+
+SCENE_FILE = "scene.safetensors"
+LIGHTS_FOLDER = "lights"
+
+MAX_SIDE = 512
+"""Long side of a carried photo, at most, in pixels."""
+
+MIN_SIDE = 64
+MAX_PIXELS = 160_000_000
+"""Pixels of all carried photos together: of more than about 800 photos each is smaller."""
+
+QUALITY = 95
+"""Of the JPEG files, without chroma subsampling."""
+
+Progress = Callable[[int, int], None]
+
+
+def carry_scene(folder: Path, scene: Scene, progress: Progress | None = None) -> None:
+    """Writes what a run needs of its scene into the run folder.
+
+    `scene.safetensors` comes last: where it is, all is there.
+
+    Args:
+        folder: The run folder.
+        scene: The scene with its photos.
+        progress: Called with (photos written, photos in all).
+
+    Raises:
+        UserError: The folder cannot be written to.
+    """
+    lights = folder / LIGHTS_FOLDER
+    side = carried_side([(view.camera.width, view.camera.height) for view in scene.views])
+
+    def write(numbered: tuple[int, View]) -> None:
+        number, view = numbered
+        try:
+            photo = view.photos.get(view.name)
+        except UserError:  # gone since it was first read; training goes on without it, too
+            return
+        _write_photo(lights, number, photo, side)
+
+    pool = ThreadPoolExecutor(DECODERS)
+    try:
+        for count, _ in enumerate(pool.map(write, enumerate(scene.views)), start=1):
+            if progress is not None:
+                progress(count, len(scene.views))
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    SceneRecord.of(scene).write(folder / SCENE_FILE)
+
+
+def carried_side(sizes: Sequence[tuple[int, int]]) -> int:
+    """The long side, in pixels, at which photos of these sizes are carried.
+
+    Args:
+        sizes: Width and height of every photo.
+    """
+    pixels_per_side = sum(min(size) / max(size) for size in sizes)
+    within_total = math.isqrt(int(MAX_PIXELS / max(pixels_per_side, 1e-9)))
+    return max(MIN_SIDE, min(MAX_SIDE, within_total))
+
+
+def _write_photo(lights: Path, number: int, photo: Photo, side: int) -> None:
+    height, width = photo.pixels.shape[:2]
+    shrink = min(1.0, side / max(width, height))
+    size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+    image = Image.fromarray(photo.pixels)
+    with written_aside(_photo_file(lights, number)) as aside:
+        small = image if size == image.size else image.resize(size, Image.Resampling.LANCZOS)
+        small.save(aside, "JPEG", quality=QUALITY, subsampling=0)
+    if photo.mask is not None:
+        mask = np.array(Image.fromarray(photo.mask).resize(size, Image.Resampling.BOX)) > 127
+        with written_aside(_mask_file(lights, number)) as aside:
+            Image.fromarray(mask).save(aside, "PNG")
+
+
+def _photo_file(lights: Path, number: int) -> Path:
+    """Numbered as the views are: photos' own names can be anything."""
+    return lights / f"{number:05d}.jpg"
+
+
+def _mask_file(lights: Path, number: int) -> Path:
+    return lights / f"{number:05d}.mask.png"
+
+
+def read_carried_scene(folder: Path) -> Scene | None:
+    """The scene that a run folder carries; its photos are decoded when they are asked for.
+
+    Returns:
+        The scene, with the run folder as its root; None for runs that carry none (of earlier versions).
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    if not (folder / SCENE_FILE).is_file():
+        return None
+    record = SceneRecord.read(folder / SCENE_FILE)
+    return record.scene(folder, CarriedPhotos(folder / LIGHTS_FOLDER, record))
+
+
+def describe_carried(folder: Path) -> str:
+    """One line about what a run folder carries, for the console."""
+    files = [file for file in (folder / LIGHTS_FOLDER).glob("*") if file.is_file()]
+    megabytes = (sum(file.stat().st_size for file in files) + (folder / SCENE_FILE).stat().st_size) / 1e6
+    count = sum(file.suffix == ".jpg" for file in files)
+    return (
+        f"{folder} carries its cameras, points and {count} photos of at most {MAX_SIDE} pixels "
+        f"({megabytes:.1f} MB): it works without the scene folder"
+    )
+
+
+class CarriedPhotos(PhotoStore):
+    """The photos in a run's `lights/`, at the size of their cameras (larger ones are interpolated)."""
+
+    def __init__(self, folder: Path, record: SceneRecord) -> None:
+        """Sets up `CarriedPhotos`.
+
+        Args:
+            folder: `lights/`.
+            record: The scene whose photos they are.
+        """
+        self._folder = folder
+        self._numbers = {name: number for number, name in enumerate(record.names)}
+        self._sizes = [(int(width), int(height)) for width, height in record.sizes]
+        self._cache = ImageCache(0)
+        self.detail = carried_side(self._sizes)
+
+    def get(self, name: str) -> Photo:
+        """See `PhotoStore.get`."""
+        return self._cache.get(name, lambda: self._decode(name))
+
+    def prefetch(self, name: str) -> None:
+        """See `PhotoStore.prefetch`."""
+        self._cache.prefetch(name, lambda: self._decode(name))
+
+    def _decode(self, name: str) -> Photo:
+        number = self._numbers[name]
+        path, size = _photo_file(self._folder, number), self._sizes[number]
+        try:
+            return Photo(read_photo(path, size=size).pixels, self._read_mask(number, size))
+        except UnreadableImageError as error:
+            raise UserError(
+                f"{path}: {error}; it is the run's copy of {name}: copy the whole run folder again"
+            ) from error
+
+    def _read_mask(self, number: int, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"] | None:
+        path = _mask_file(self._folder, number)
+        return read_mask(path, size) if path.is_file() else None

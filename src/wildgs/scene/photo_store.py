@@ -1,0 +1,275 @@
+"""One store of photos: a view's pixels, mask and depth prior, decoded when they are needed."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import is_file
+from wildgs.scene.config import MAX_IMAGE_PIXELS
+from wildgs.scene.image_cache import ImageCache
+from wildgs.scene.images import (
+    Photo,
+    ShapeMismatchError,
+    UnreadableImageError,
+    read_disparity,
+    read_mask,
+    read_photo,
+)
+from wildgs.scene.undistort import PixelGrid, inside, sample_colors, sample_disparity, sample_mask
+
+
+def with_ending(name: str, ending: str) -> str:
+    """A photo's name with another ending, sub-folders kept."""
+    return str(PurePosixPath(name).with_suffix(ending))
+
+
+def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Where a scene keeps the disparity of its photos.
+
+    `depth/<stem>.png`, sub-folders kept; photos that differ by their ending alone (`a.jpg` and `a.png`) have
+    `depth/<name>.png`, so that no two share a file.
+
+    Args:
+        root: The scene's folder.
+        names: All photos of its model.
+    """
+    names = list(names)
+    shared = _shared_stems(names)
+    return {
+        name: root
+        / "depth"
+        / (f"{name}.png" if with_ending(name, "") in shared else with_ending(name, ".png"))
+        for name in names
+    }
+
+
+def _shared_stems(names: Iterable[str]) -> set[str]:
+    """Names without ending that several photos have."""
+    counts = Counter(with_ending(name, "") for name in names)
+    return {stem for stem, count in counts.items() if count > 1}
+
+
+class PhotoStore(ABC):
+    """Where the views of a scene read their photos, by name.
+
+    Attributes:
+        detail: Long side, in pixels, beyond which the photos hold no detail; None without such a limit.
+    """
+
+    detail: int | None = None
+
+    @abstractmethod
+    def get(self, name: str) -> Photo:
+        """A photo at the size of its view's camera.
+
+        Raises:
+            UserError: It cannot be read.
+        """
+
+    def prefetch(self, name: str) -> None:  # noqa: B027 - stores that need no preparation do nothing
+        """Says that a photo's turn comes soon, so that it can be decoded in the background."""
+
+    def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The photo without its transients (only evaluation may look at it); None where there is none.
+
+        Raises:
+            UserError: The file is there and cannot be used.
+        """
+        return None
+
+    def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
+        """Where the photo shows the static scene (255) or a transient (0); None where that is not known.
+
+        Raises:
+            UserError: The file is there and cannot be used.
+        """
+        return None
+
+
+@dataclass
+class MemoryPhotos(PhotoStore):
+    """Photos that are in memory already.
+
+    Attributes:
+        photos: By name.
+        clean: Photos without their transients, by name.
+        truth_masks: True masks, by name.
+    """
+
+    photos: dict[str, Photo] = field(default_factory=dict)
+    clean: dict[str, UInt8[np.ndarray, "_ _ 3"]] = field(default_factory=dict)
+    truth_masks: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
+
+    def get(self, name: str) -> Photo:
+        """See `PhotoStore.get`."""
+        return self.photos[name]
+
+    def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+        """See `PhotoStore.read_clean`."""
+        return self.clean.get(name)
+
+    def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
+        """See `PhotoStore.read_truth_mask`."""
+        return self.truth_masks.get(name)
+
+
+class ScenePhotos(PhotoStore):
+    """The photos of a scene folder with their masks and depth priors, decoded within a memory limit."""
+
+    def __init__(
+        self,
+        root: Path,
+        images_dir: Path,
+        names: Sequence[str],
+        cache: ImageCache,
+        *,
+        use_masks: bool = True,
+        use_depth: bool = True,
+        max_pixels: int = MAX_IMAGE_PIXELS,
+    ) -> None:
+        """Sets up `ScenePhotos` without photos; `add` makes them known.
+
+        Args:
+            root: The scene's folder.
+            images_dir: The folder of its photos.
+            names: All photos of its model; they tell which files a mask or depth prior belongs to.
+            cache: Keeps decoded photos.
+            use_masks: Whether the user's masks are read.
+            use_depth: Whether depth priors are read.
+            max_pixels: Larger pictures are refused.
+        """
+        self.root = root
+        self.images_dir = images_dir
+        self.cache = cache
+        self.use_masks = use_masks
+        self.use_depth = use_depth
+        self.max_pixels = max_pixels
+        self._grids: dict[str, PixelGrid] = {}
+        self._depth = depth_files(root, names)
+        self._shared = _shared_stems(names)
+        self._without_depth: set[str] = set()
+
+    def add(self, name: str, grid: PixelGrid) -> None:
+        """Makes a photo known.
+
+        Args:
+            name: Its path within the folder of photos.
+            grid: From the stored photo's pixels to the view's.
+        """
+        self._grids[name] = grid
+
+    def load(self, name: str, *, keep: bool) -> None:
+        """Decodes a photo for the first time.
+
+        Args:
+            name: Of the photo.
+            keep: Whether it may stay in memory for good, as photos that train do.
+
+        Raises:
+            UnreadableImageError: The photo itself cannot be decoded.
+            UserError: The photo has another shape than its camera, or its mask cannot be used.
+        """
+        self.cache.put(name, self._decode(name), keep=keep)
+
+    def get(self, name: str) -> Photo:
+        """See `PhotoStore.get`."""
+        try:
+            return self.cache.get(name, lambda: self._decode(name))
+        except UnreadableImageError as error:
+            raise UserError(
+                f"{self.images_dir / name}: {error}; put the photo back, or replace it"
+            ) from error
+
+    def prefetch(self, name: str) -> None:
+        """See `PhotoStore.prefetch`."""
+        self.cache.prefetch(name, lambda: self._decode(name))
+
+    def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+        """See `PhotoStore.read_clean`: `truth/clean/<stem>.png`."""
+        path = self._find("truth/clean", with_ending(name, ".png"))
+        if path is None:
+            return None
+        grid = self._grids[name]
+        try:
+            photo = read_photo(path, camera_size=grid.camera_size, size=grid.resized)
+        except UnreadableImageError as error:
+            raise UserError(f"{path}: {error}; repair the file or remove it") from error
+        source = grid.source()
+        return photo.pixels if source is None else sample_colors(photo.pixels, source)
+
+    def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
+        """See `PhotoStore.read_truth_mask`: `truth/masks/<stem>.png`."""
+        path = self._find("truth/masks", with_ending(name, ".png"))
+        return None if path is None else self._read_mask(path, self._grids[name])
+
+    def find_mask(self, name: str) -> Path | None:
+        """The user's mask: `masks/<name>.png` (as COLMAP), `masks/<name>`, or `masks/<stem>.png` if unambiguous."""
+        stem = with_ending(name, "")
+        candidates = [f"{name}.png", name, *([] if stem in self._shared else [f"{stem}.png"])]
+        return self._find("masks", *candidates)
+
+    def _find(self, folder: str, *names: str) -> Path | None:
+        return next((path for name in names if is_file(path := self.root / folder / name)), None)
+
+    def _read_mask(self, path: Path, grid: PixelGrid) -> UInt8[np.ndarray, "H W"]:
+        try:
+            mask = read_mask(path, grid.resized, self.max_pixels)
+        except UnreadableImageError as error:
+            raise UserError(f"{path}: {error}; repair the mask or remove it") from error
+        source = grid.source()
+        return mask if source is None else sample_mask(mask, source)
+
+    def _decode(self, name: str) -> Photo:
+        """Decodes a photo with what belongs to it.
+
+        Raises:
+            UnreadableImageError: The photo itself cannot be decoded.
+            UserError: The photo has another shape than its camera, or its mask cannot be used.
+        """
+        path, grid = self.images_dir / name, self._grids[name]
+        try:
+            photo = read_photo(
+                path, camera_size=grid.camera_size, size=grid.resized, max_pixels=self.max_pixels
+            )
+        except ShapeMismatchError as error:
+            raise UserError(f"{path}: {error}; the photos must be those the model was made from") from error
+        source = grid.source()
+        pixels, masks = photo.pixels, []
+        if photo.mask is not None:
+            masks.append(photo.mask if source is None else sample_mask(photo.mask, source))
+        if source is not None:
+            pixels = sample_colors(pixels, source)
+            masks.append(np.where(inside(source, grid.resized), 255, 0).astype(np.uint8))
+        mask_path = self.find_mask(name) if self.use_masks else None
+        if mask_path is not None:
+            masks.append(self._read_mask(mask_path, grid))
+        mask = np.minimum.reduce(masks) if masks else None
+        return Photo(pixels, None if mask is None or mask.all() else mask, self._read_disparity(name, grid))
+
+    def _read_disparity(self, name: str, grid: PixelGrid) -> UInt16[np.ndarray, "H W"] | None:
+        """The depth prior; one that is missing or broken is not looked for, and warned of, again."""
+        path = self._depth[name]
+        if not self.use_depth or name in self._without_depth or not is_file(path):
+            self._without_depth.add(name)
+            return None
+        try:
+            disparity = read_disparity(path, grid.resized, self.max_pixels)
+        except UnreadableImageError as error:
+            self._without_depth.add(name)
+            warnings.warn(
+                f"{path}: {error}; this photo trains without depth (delete the file and run `wildgs depth`)",
+                WildGSWarning,
+                stacklevel=2,
+            )
+            return None
+        source = grid.source()
+        return disparity if source is None else sample_disparity(disparity, source)
