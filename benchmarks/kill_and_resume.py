@@ -86,9 +86,9 @@ def _child(arguments: list[str], output: Path, stage: str | None) -> None:
     os.dup2(handle, 2)
     sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115 - for the process's life
     sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
-    from wildgs.cli import main, progress
+    from wildgs.cli import main, screen
 
-    progress.console.file = sys.stdout
+    screen.console.file = sys.stdout
     if stage is not None:
         _kill_inside(stage, 2)
     main(arguments)

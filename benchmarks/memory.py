@@ -120,7 +120,7 @@ def _train_on_photos(command: Command) -> None:
     from wildgs.model.registry import create_method
     from wildgs.model.wildgs import WildGSConfig
     from wildgs.scene import DataConfig, load_scene
-    from wildgs.scene.image_cache import parse_bytes
+    from wildgs.scene.config import parse_bytes
     from wildgs.scene.images import read_photo
 
     with tempfile.TemporaryDirectory() as name:

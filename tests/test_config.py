@@ -8,6 +8,7 @@ import pytest
 
 from wildgs.config import RunConfig, differing_entries, with_entries
 from wildgs.errors import UserError
+from wildgs.model.config import WrappingConfig
 
 BASE = RunConfig(Path("scene"))
 
@@ -37,3 +38,15 @@ def test_changes_what_it_names_and_nothing_else():
 def test_what_does_not_exist_or_fit_is_named(entries, said):
     with pytest.raises(UserError, match=said):
         with_entries(BASE, entries)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"resolution": 200_000}, {"resolution": 0}, {"features": 10**6}, {"widths": ()}, {"widths": (8, 10**6)},
+     {"crop_ratio": 0.0}, {"crop_ratio": float("nan")}, {"box_quantile": 0.5}, {"partial_lifts": 2.0}],
+)  # fmt: skip
+def test_planes_that_no_memory_holds_are_refused(wrong: dict) -> None:
+    """A configuration file may say 200,000 cells a side, which are 1.9 TB."""
+    (name,) = wrong
+    with pytest.raises(UserError, match=f"wrapping.{name} "):
+        WrappingConfig(**wrong)

@@ -17,7 +17,9 @@ def test_default_changes_nothing() -> None:
 def test_paper_leaves_out_all_that_is_ours() -> None:
     changed = differing_entries(BASE, with_preset(BASE, "paper"))
     assert {path: new for path, (_, new) in changed.items()} == {
+        "model.parsing.encoder": "microsoft/resnet-18",
         "model.parsing.color_statistics": False,
+        "model.wrapping.resolution": 128,
         "model.fusion.color_transform": False,
         "model.fusion.sh_degree": 3,
         "model.depth_points.points": 0,

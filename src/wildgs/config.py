@@ -38,6 +38,8 @@ class ExecutionConfig:
         log_every: Steps between entries of metrics.jsonl and tensorboard.
         pictures_every: Steps between pictures on tensorboard.
         cuda_graphs: Record and replay networks as CUDA graphs, where there is CUDA.
+        feature_cache: Memory for the features that the frozen encoder gave of training photos; those of photos
+            beyond it are computed again when their turn comes.
         threads: CPU threads of kernels and torch; by default WILDGS_NUM_THREADS, or all cores.
     """
 
@@ -47,11 +49,13 @@ class ExecutionConfig:
     log_every: int = 50
     pictures_every: int = 500
     cuda_graphs: bool = True
+    feature_cache: str = "1GB"
     threads: int | None = None
 
     def __post_init__(self) -> None:
         """Refuses values that mean nothing."""
         parse_bytes(self.image_cache)
+        parse_bytes(self.feature_cache)
         for name in ("checkpoint_every", "checkpoint_minutes", "log_every", "pictures_every", "threads"):
             value = getattr(self, name)
             if value is not None and not value > 0:

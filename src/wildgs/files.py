@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,8 @@ from wildgs.errors import UserError
 
 MAX_NAME_BYTES = 255
 """Longest file name that common file systems take."""
+
+_BIDI_CONTROLS = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 
 ASIDE_SUFFIX = ".part"
 
@@ -103,10 +106,15 @@ def check_regular(path: Path) -> None:
 def printable(name: str) -> str:
     r"""A file's name as text that every screen, page and text file can hold.
 
-    Names are bytes on most systems. Bytes that are not UTF-8 and characters that do not print (control characters,
-    reversed writing) are shown as escapes such as `\xe9`.
+    Names are bytes on most systems. Bytes that are not UTF-8, control characters, line ends and characters that
+    reverse the direction of writing are shown as escapes such as `\xe9`.
     """
-    return "".join(character if character.isprintable() else _escaped(character) for character in name)
+    return "".join(_escaped(character) if is_unprintable(character) else character for character in name)
+
+
+def is_unprintable(character: str) -> bool:
+    """Whether a character of a name is a control character or a byte that is not UTF-8."""
+    return unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or character in _BIDI_CONTROLS
 
 
 def _escaped(character: str) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from wildgs.config import RunConfig, with_entries
+from wildgs.model.config import RESNET18
 
 PresetName = Literal["default", "paper", "fast"]
 PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
@@ -29,7 +30,9 @@ PRESETS: dict[PresetName, Preset] = {
     "default": Preset(),
     "paper": Preset(
         {
+            "model.parsing.encoder": RESNET18,
             "model.parsing.color_statistics": False,
+            "model.wrapping.resolution": 128,
             "model.fusion.color_transform": False,
             "model.fusion.sh_degree": 3,
             "model.depth_points.points": 0,

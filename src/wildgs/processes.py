@@ -1,10 +1,14 @@
-"""This process: its place among those that torchrun started, and its environment. Imports nothing large."""
+"""The process: its place among those that torchrun started, signals that end it, its environment. Imports little."""
 
 from __future__ import annotations
 
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
 LIBRARY_DEFAULTS = {
     # oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024. A collection of
@@ -29,6 +33,49 @@ def library_environment() -> Iterator[None]:
     finally:
         for name in added:
             os.environ.pop(name, None)
+
+
+ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class TerminatedError(KeyboardInterrupt):
+    """The process was asked to end.
+
+    An interrupt, so that whatever is temporary is removed on the way out.
+
+    Attributes:
+        code: The process's exit code by the shell's convention, 128 + signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__("terminated")
+        self.code = 128 + number
+
+
+@contextmanager
+def signals_as_interrupts() -> Iterator[None]:
+    """Has SIGTERM and SIGHUP raise `TerminatedError` in the block; the second one ends the process at once.
+
+    Signals that the process ignores (nohup) stay ignored. Outside the main thread, where Python allows no handlers,
+    nothing changes.
+    """
+    previous: dict[int, Any] = {}
+
+    def end(number: int, _: FrameType | None) -> None:
+        for other in previous:
+            signal.signal(other, signal.SIG_DFL)
+        raise TerminatedError(number)
+
+    if threading.current_thread() is threading.main_thread():
+        for number in ENDING_SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                # Also where Python's handler is the same: pycolmap sets one of its own, which prints a C++ stack.
+                previous[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def world_size() -> int:

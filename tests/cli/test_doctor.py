@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from wildgs.cli.doctor import Command, run
-from wildgs.evaluation.lpips_weights import ENVIRONMENT
+from wildgs.evaluation.lpips import ENVIRONMENT
 from wildgs.library import doctor
 from wildgs.library.doctor import Check, examine
 
@@ -32,22 +32,26 @@ def test_what_every_installation_has_works():
 
 def test_missing_weights_come_with_the_command_that_gets_them():
     checks = by_name()
-    assert checks["encoder weights"].state == "missing"
-    assert checks["encoder weights"].remedy == "hf download microsoft/resnet-18"
     assert checks["depth weights"].state == "missing"
     assert checks["depth weights"].remedy == "hf download depth-anything/Depth-Anything-V2-Small-hf"
-    assert checks["LPIPS weights"].state == "missing"
-    assert "alexnet-owt-7be5be79.pth" in (checks["LPIPS weights"].remedy or "")
+
+
+def test_packaged_weights_work(monkeypatch):
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    checks = by_name()
+    assert checks["encoder weights"].state == "works"
+    assert checks["LPIPS weights"].state == "works"
+    assert "(squeeze)" in checks["LPIPS weights"].detail
 
 
 def test_cached_weights_are_seen(monkeypatch, tmp_path):
-    repository = tmp_path / "hub" / "models--microsoft--resnet-18"
+    repository = tmp_path / "hub" / "models--depth-anything--Depth-Anything-V2-Small-hf"
     snapshot = repository / "snapshots" / ("a" * 40)
     snapshot.mkdir(parents=True)
     (snapshot / "model.safetensors").write_bytes(b"weights")
     (repository / "refs").mkdir()
     (repository / "refs" / "main").write_text("a" * 40)
-    assert by_name()["encoder weights"].state == "works"
+    assert by_name()["depth weights"].state == "works"
 
 
 def test_broken_lpips_weights_are_broken(monkeypatch, tmp_path):

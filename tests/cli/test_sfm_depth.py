@@ -1,10 +1,13 @@
 from pathlib import Path
 
 import pytest
+import torch
+from PIL import Image
 
 from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
 from wildgs.library import pipeline
+from wildgs.priors.depth import DepthEstimator
 from wildgs.sfm import reconstruction
 from wildgs.sfm.report import SfmReport
 
@@ -73,3 +76,41 @@ def test_depth_reports_what_it_wrote(
     depth.run(depth.Command(tmp_path, model="here", device="cpu"))
     assert asked == {"source": "here", "device": "cpu", "required": True}
     assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
+    make_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photos that have depth are not estimated again; once training has begun, depth stays as it was then."""
+    root = make_scene(3)
+    output = tmp_path / "run"
+    output.mkdir()
+    root.rename(output / "scene")
+    depth_folder = output / "scene/depth"
+    estimated: list[int] = []
+
+    class Estimator(DepthEstimator):
+        def __init__(self) -> None:
+            super().__init__(torch.nn.Identity())
+
+        def estimate(self, photo: torch.Tensor) -> torch.Tensor:
+            estimated.append(len(photo))
+            return torch.rand(photo.shape[:2])
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "load_depth_anything", Estimator)
+    monkeypatch.setattr(pipeline, "_pose", lambda *_: None)
+    monkeypatch.setattr(pipeline, "train", stop)
+    depth_folder.mkdir()
+    Image.new("I;16", (48, 32)).save(depth_folder / "p00.png")
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            pipeline.run(output / "scene/images", output)
+        assert len(estimated) == 2
+    (depth_folder / "p01.png").unlink()
+    (output / "config.yaml").write_text("")
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run(output / "scene/images", output)
+    assert len(estimated) == 2

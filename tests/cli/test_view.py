@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -41,7 +44,10 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
 def test_view_opens_the_run_and_says_where(trained: Path, wildgs, left_open: list[Any], capsys) -> None:
     assert wildgs("view", trained, "--port", 0) == 0
     (viewer,) = left_open
-    assert f"http://127.0.0.1:{viewer.server.get_port()}" in capsys.readouterr().out.replace("\n", "")
+    address = f"http://127.0.0.1:{viewer.server.get_port()}/{viewer.server.access.token}/"
+    assert any(line.endswith(address) for line in capsys.readouterr().out.splitlines()), (
+        "on one line, to copy"
+    )
     assert len(viewer.display._handle.centers) == len(viewer.subject.method.gaussians)
     assert viewer.recording.folder == trained / "videos"
 
@@ -56,14 +62,33 @@ def test_view_begins_with_the_lights_asked_for(
 
 
 def test_train_shows_itself_and_ends_as_ever(
-    landmark: Path, tmp_path: Path, wildgs, left_open: list[Any]
+    landmark: Path, tmp_path: Path, wildgs, left_open: list[Any], capsys
 ) -> None:
     assert wildgs("train", landmark, "--output", tmp_path / "run", "--view", "--server.port", 0, *TINY) == 0
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == [
         "step_00000004.safetensors"
     ]
+    assert f"/{left_open[0].server.access.token}/" in capsys.readouterr().out
     assert left_open[0].recording.folder is None, "no videos while it trains"
     assert "trained 4 steps" in left_open[0]._status.content
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_signals_leave_no_temporary_folder(trained: Path, tmp_path: Path, number: int) -> None:
+    """Uploaded pictures lie in one while the viewer is open."""
+    command = [sys.executable, "-m", "wildgs", "view", str(trained), "--port", "0"]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as viewer:
+        assert viewer.stdout is not None
+        assert any("Ctrl-C ends" in line for line in viewer.stdout)
+        assert [path.name[:12] for path in tmp_path.iterdir()] == ["wildgs-view-"]
+        viewer.send_signal(number)
+        _, error = viewer.communicate(timeout=120)
+    assert viewer.returncode == 128 + number
+    assert "***" not in error
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from wildgs.engine.schedule import Schedule, ScheduleConfig, exponential
+from wildgs.errors import UserError
 
 
 def test_paper_length_keeps_the_papers_steps() -> None:
@@ -16,6 +17,26 @@ def test_paper_length_keeps_the_papers_steps() -> None:
     assert not schedule.densifies(650)
     assert not schedule.densifies(15_000)
     assert [step for step in range(0, 30_000) if schedule.resets(step)] == [3000, 6000, 9000, 12_000]
+
+
+def test_densification_can_be_switched_off() -> None:
+    """Pruning and resets are a part of it; the mask then never pauses."""
+    off = Schedule(ScheduleConfig(densify_every=0), 30_000)
+    assert not any(
+        off.densifies(s) or off.resets(s) or off.mask_paused(s) or off.gathers(s) for s in range(30_000)
+    )
+    without_resets = Schedule(ScheduleConfig(reset_every=0), 3000)
+    assert not any(without_resets.resets(s) or without_resets.mask_paused(s) for s in range(3000))
+    assert any(without_resets.densifies(s) for s in range(3000))
+
+
+@pytest.mark.parametrize("name", ["densify_every", "reset_every", "first_stage", "sh_every", "encoder_every"])
+def test_impossible_steps_are_one_line(name: str) -> None:
+    with pytest.raises(UserError, match=rf"schedule\.{name} -1: must be"):
+        ScheduleConfig(**{name: -1})
+    if name in ("sh_every", "encoder_every"):
+        with pytest.raises(UserError, match="must be 1 or more"):
+            ScheduleConfig(**{name: 0})
 
 
 def test_half_length_halves() -> None:

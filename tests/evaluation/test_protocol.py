@@ -10,7 +10,7 @@ from PIL import Image
 
 from tests.memory_views import make_view
 from wildgs.errors import UserError
-from wildgs.evaluation.lpips_weights import ENVIRONMENT
+from wildgs.evaluation.lpips import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance

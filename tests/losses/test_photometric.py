@@ -4,7 +4,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.losses.photometric import masked_photometric, transient_evidence
+from wildgs.losses.evidence import (
+    FLAT,
+    PROOF,
+    color_evidence,
+    proven_static,
+    structural_correlation,
+    transient_evidence,
+)
+from wildgs.losses.photometric import masked_photometric
 from wildgs.losses.ssim import _ConvolutionSSIM, gaussian_taps, ssim
 
 
@@ -164,13 +172,13 @@ def test_evidence_is_zero_for_equal_and_local_for_unlike_pictures():
     assert evidence[26:, 26:].abs().max() < 1e-12
 
 
-def test_evidence_is_of_another_colour_more_than_of_shade():
+def test_evidence_of_colour_is_of_another_hue_more_than_of_shade():
     photo = torch.full((120, 120, 3), 0.5)
     evidence = []
     for change in ([0.12, 0.12, 0.12], [0.17, -0.085, -0.085]):  # equally long
         render = photo.clone()
         render[40:60, 40:60] += torch.tensor(change)
-        evidence.append(float(transient_evidence(photo, render)[45:55, 45:55].mean()))
+        evidence.append(float(color_evidence(photo, render)[45:55, 45:55].mean()))
     assert evidence[1] > 3 * evidence[0]
 
 
@@ -181,6 +189,63 @@ def test_evidence_does_not_see_detail_that_is_a_pixel_off():
     render[:, :60] = photo[:, :60].roll(1, dims=1)
     assert float((photo - render)[:, :60].abs().mean()) > 0.5
     assert float(transient_evidence(photo, render).max()) < 0.01
+
+
+def landscape(seed: int) -> torch.Tensor:
+    """Textured stone: noise of three pixels a cell in one tint."""
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.rand(1, 1, 40, 40, generator=generator) * torch.tensor([1.0, 0.9, 0.7])[:, None, None]
+    picture = torch.nn.functional.interpolate(cells, (120, 120), mode="bilinear")[0].permute(1, 2, 0)
+    return 0.2 + 0.6 * picture
+
+
+@given(
+    seed=st.integers(0, 2**16),
+    gain=st.lists(st.floats(0.4, 1.2), min_size=3, max_size=3),
+    offset=st.lists(st.floats(-0.05, 0.05), min_size=3, max_size=3),
+)
+@settings(max_examples=25, deadline=None)
+def test_another_light_is_no_evidence(seed, gain, offset):
+    """Whatever an affine change does to the colours of all or half of a photo, hue included."""
+    render = landscape(seed)
+    light = (render * torch.tensor(gain) + torch.tensor(offset)).clamp(0, 1)
+    assert float(transient_evidence(light, render).max()) < 0.2
+    half = render.clone()
+    half[:, :60] = light[:, :60]
+    assert float(transient_evidence(half, render)[:, :50].max()) < 0.2
+
+
+def test_a_pasted_object_is_evidence_in_any_light():
+    render = landscape(0)
+    for light in (torch.ones(3), torch.tensor([1.1, 0.8, 0.6])):
+        photo = render * light
+        photo[40:70, 50:65] = torch.tensor([0.9, 0.1, 0.1]) * (0.5 + landscape(1)[40:70, 50:65])
+        evidence = transient_evidence(photo, render)
+        assert float(evidence[45:65, 53:62].mean()) > 0.1
+        assert float(evidence[90:].max()) < 0.01
+
+
+def test_flat_areas_are_alike_and_a_flat_one_is_unlike_texture():
+    flat, other = torch.full((120, 120, 3), 0.8), torch.full((120, 120, 3), 0.2)
+    assert float(structural_correlation(flat, other).min()) > 0.99
+    assert float(transient_evidence(flat, other).max()) == 0
+    assert float(structural_correlation(flat, landscape(0)).mean()) < 0.5
+
+
+def test_structural_correlation_is_the_windows_own():
+    """Against the definition, at one pixel, without what the windows are taken to share."""
+    photo, render = landscape(2), landscape(3)
+    photo[40:80, 40:80] += 0.3 * landscape(4)[40:80, 40:80]
+    row, column, radius = 60, 47, 2  # 120 pixels, 24 windows: 5 pixels a side
+    x, y = (
+        p[row - radius : row + radius + 1, column - radius : column + radius + 1].mean(dim=2).flatten()
+        for p in (photo, render)
+    )
+    covariance = ((x - x.mean()) * (y - y.mean())).mean() + FLAT**2
+    expected = covariance / ((x.var(correction=0) + FLAT**2) * (y.var(correction=0) + FLAT**2)).sqrt()
+    assert float(structural_correlation(photo, render)[row, column]) == pytest.approx(
+        float(expected), abs=1e-4
+    )
 
 
 def test_hiding_a_wrong_region_lowers_the_loss():
@@ -222,3 +287,27 @@ def test_convolutions_stay_on_their_device():
     value.backward()
     assert value.device.type == "meta"
     assert [picture.grad.device.type for picture in pictures if picture.grad is not None] == ["meta", "meta"]
+
+
+def test_cells_with_observations_are_proven_static():
+    observations = torch.tensor([[10.5, 3.0], [59.9, 39.9]])
+    proven = proven_static(observations, 40, 60)
+    assert bool(proven[3, 10])
+    assert bool(proven[39, 59])
+    assert int(proven.sum()) == 2, "60 pixels have cells of one"
+    assert int(proven_static(observations * 4, 160, 240).sum()) == 2 * 16
+    assert not proven_static(torch.zeros(0, 2), 40, 60).any()
+
+
+def test_proof_shows_what_evidence_would_hide_and_sky_is_never_hidden():
+    photo, _ = pictures(60, 60)
+    render = photo.clone()
+    render[20:40, 20:40] = 1 - render[20:40, 20:40]
+    visibility = torch.full((60, 60), 0.9, dtype=torch.float64, requires_grad=True)
+    proven, sky = torch.zeros(60, 60, dtype=torch.bool), torch.zeros(60, 60, dtype=torch.bool)
+    proven[20:40, 20:26], sky[20:40, 34:40] = True, True
+    masked_photometric(photo, render, visibility, proven=proven, sky=sky).backward()
+    gradient = visibility.grad[22:38]
+    assert bool((gradient[:, 20:26] == -PROOF / 3600).all())
+    assert float(gradient[:, 27:33].mean()) > 0.1 / 3600
+    assert bool((gradient[:, 34:40] == 0).all())

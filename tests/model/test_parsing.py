@@ -7,19 +7,22 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.nn import functional
 from transformers import ResNetConfig, ResNetModel
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.model.encoder import FEATURE_WIDTHS, FrozenBatchNorm, load_encoder
-from wildgs.model.parsing import Parsing, ParsingConfig
+from wildgs.model.config import SQUEEZENET, ParsingConfig
+from wildgs.model.encoder import RESNET_WIDTHS, FrozenBatchNorm, SqueezeNetEncoder, load_encoder
+from wildgs.model.feature_cache import FeatureCache, pack, unpack
+from wildgs.model.parsing import Parsing
 from wildgs.model.precision import lay_out_channels_last, set_precision
 from wildgs.model.replays import MOST_GRAPHS
 
 
-@pytest.fixture(scope="module")
-def parsing() -> Parsing:
+@pytest.fixture(scope="module", params=[SQUEEZENET, None], ids=["squeezenet", "resnet"])
+def parsing(request: pytest.FixtureRequest) -> Parsing:
     torch.manual_seed(0)
-    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(request.param))
     parsing.calibrate([torch.rand(40, 60, 3) for _ in range(4)])
     return parsing
 
@@ -74,7 +77,10 @@ def test_brightness_reaches_the_global_embedding(parsing: Parsing) -> None:
     assert difference > 1e-3
 
 
-def test_mask_and_embedding_train_the_encoder(parsing: Parsing) -> None:
+def test_mask_and_embedding_train_a_resnet() -> None:
+    torch.manual_seed(0)
+    parsing = Parsing(ParsingConfig(max_side=64), load_encoder(None))
+    parsing.calibrate([torch.rand(40, 60, 3) for _ in range(4)])
     torch.nn.init.normal_(parsing.mask_head.weight, std=0.1)
     for output in (0, 1):
         parsing.zero_grad()
@@ -84,12 +90,103 @@ def test_mask_and_embedding_train_the_encoder(parsing: Parsing) -> None:
         assert gradient.abs().sum() > 0
 
 
+def reference_squeezenet(images: torch.Tensor, weights: dict[str, torch.Tensor]) -> list[torch.Tensor]:
+    """SqueezeNet 1.1 as its paper draws it, by functional calls on named weights."""
+
+    def convolve(x: torch.Tensor, name: str, **options: int) -> torch.Tensor:
+        return functional.conv2d(x, weights[f"{name}.weight"], weights[f"{name}.bias"], **options).clamp_min(
+            0
+        )
+
+    x, taps = convolve(images, "0", stride=2), []
+    for stage in ((3, 4), (6, 7), (9, 10, 11, 12)):
+        x = functional.max_pool2d(x, 3, 2, ceil_mode=True)
+        for fire in stage:
+            x = convolve(x, f"{fire}.squeeze")
+            x = torch.cat(
+                [convolve(x, f"{fire}.expand1x1"), convolve(x, f"{fire}.expand3x3", padding=1)], dim=1
+            )
+            if fire in (4, 7, 9, 12):
+                taps.append(x)
+    return taps
+
+
+@pytest.mark.shared
+def test_frozen_features_are_those_of_the_published_weights(shared: Path) -> None:
+    file = shared / "weights" / "lpips_squeeze" / "squeezenet1_1_features.pth"
+    weights = torch.load(file, map_location="cpu", weights_only=True)
+    images = torch.rand(2, 3, 96, 128, generator=torch.Generator().manual_seed(0))
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    expected = reference_squeezenet((images - mean[:, None, None]) / std[:, None, None], weights)
+    encoder = load_encoder()
+    assert isinstance(encoder, SqueezeNetEncoder)
+    for ours, theirs in zip(encoder.raw(images), expected, strict=True):
+        assert ours.dtype == torch.float16
+        assert float((ours.float() - theirs).norm() / theirs.norm()) < 2e-3
+
+
+def test_frozen_features_are_standardised_over_the_collection_and_the_statistics_saved() -> None:
+    encoder = load_encoder()
+    images = torch.rand(4, 3, 64, 64) * torch.rand(4, 3, 1, 1)
+    encoder.calibrate(images)
+    for features in encoder(images):
+        torch.testing.assert_close(
+            features.mean(dim=(0, 2, 3)), torch.zeros(features.shape[1]), atol=1e-2, rtol=0
+        )
+        assert float(features.std()) == pytest.approx(1, abs=0.02)
+    state = encoder.state_dict()
+    assert sum(value.numel() for value in state.values()) < 10_000, (
+        "the package's weights are in no checkpoint"
+    )
+    other = load_encoder()
+    other.load_state_dict(state)
+    for ours, theirs in zip(encoder(images), other(images), strict=True):
+        assert torch.equal(ours, theirs)
+    assert list(encoder.parameters()) == []
+
+
+def test_kept_features_have_no_influence_and_stay_within_the_limit() -> None:
+    torch.manual_seed(0)
+    parsing = Parsing(ParsingConfig(max_side=64))
+    photos = {f"{index}.jpg": torch.rand(48, 64, 3) for index in range(3)}
+    parsing.calibrate(list(photos.values()))
+    torch.nn.init.normal_(parsing.mask_head.weight)
+    expected = {name: parsing(photo) for name, photo in photos.items()}
+    one = pack(parsing.encoder.raw(parsing.shrink(photos["0.jpg"])))[0].nbytes  # pyright: ignore
+    cache = parsing.feature_cache = FeatureCache(int(2.5 * one))
+    for _ in range(2):
+        for name, photo in photos.items():
+            for found, wanted in zip(parsing(photo, name=name), expected[name], strict=True):
+                assert torch.equal(found, wanted)
+    assert len(cache) == 2
+    assert 0 < cache.num_bytes <= cache.limit
+    parsing(torch.rand(48, 64, 3))
+    assert len(cache) == 2, "photos without a name are not kept"
+
+
+def test_features_are_computed_once_a_photo(monkeypatch: pytest.MonkeyPatch) -> None:
+    parsing = Parsing(ParsingConfig(max_side=64))
+    parsing.feature_cache = FeatureCache(2**20)
+    calls = []
+    raw = parsing.encoder.raw
+    monkeypatch.setattr(parsing.encoder, "raw", lambda images: calls.append(1) or raw(images))
+    for _ in range(3):
+        parsing(torch.rand(48, 64, 3), name="a.jpg")
+    assert len(calls) == 1
+
+
+def test_packed_tensors_come_back() -> None:
+    tensors = [torch.rand(1, 3, 4, 5).half(), torch.rand(1, 6).half()]
+    for found, wanted in zip(unpack(*pack(tensors)), tensors, strict=True):
+        assert torch.equal(found, wanted)
+
+
 def test_calibration_normalises_a_fresh_encoder() -> None:
     encoder = load_encoder(None)
     images = torch.rand(4, 3, 64, 64) * 0.1
     encoder.calibrate(images)
     features = encoder(images)
-    assert [f.shape[1] for f in features] == list(FEATURE_WIDTHS)
+    assert [f.shape[1] for f in features] == list(RESNET_WIDTHS)
     assert 0.1 < float(features[-1].detach().std()) < 10
 
 
@@ -113,7 +210,7 @@ def test_colour_statistics_alone_tell_casts_and_brightness_apart() -> None:
     green = torch.tensor([0.95, 1.05, 0.95])
     parsing.calibrate([photos[0] * green, *photos[1:3], photos[3] * green, photos[4]])
     with torch.no_grad():
-        parsing.global_mlp[0].weight[:, : FEATURE_WIDTHS[-1]] = 0.0
+        parsing.global_mlp[0].weight[:, : RESNET_WIDTHS[-1]] = 0.0
         embedding = parsing(photos[2])[1]
         shuffled = photos[2].reshape(-1, 3)[torch.randperm(64 * 64)].reshape(64, 64, 3)
         torch.testing.assert_close(parsing(shuffled)[1], embedding, atol=1e-4, rtol=0)
@@ -123,7 +220,7 @@ def test_colour_statistics_alone_tell_casts_and_brightness_apart() -> None:
 
 def test_without_colour_statistics_embeddings_are_of_features_alone() -> None:
     parsing = Parsing(ParsingConfig(max_side=64, color_statistics=False), load_encoder(None))
-    assert parsing.global_mlp[0].in_features == FEATURE_WIDTHS[-1]
+    assert parsing.global_mlp[0].in_features == RESNET_WIDTHS[-1]
     assert parsing(torch.rand(64, 64, 3))[1].shape == (16,)
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
 
 from wildgs.priors.ground import GroundConfig, find_ground, ground_points
 
@@ -87,3 +88,24 @@ def test_where_no_ground_shows_there_is_none(points: torch.Tensor, centers: torc
 def test_none_is_wanted() -> None:
     known = paving()
     assert len(ground_points(known, grey(known), cameras(), GroundConfig(points=0))[0]) == 0
+
+
+def test_a_stray_camera_asks_for_no_large_grid(monkeypatch) -> None:
+    """1,000 units away: the whole grid would have 6 * 10^8 places."""
+    points = torch.cat([paving(), wall()])
+    colors = torch.cat([grey(paving()), grey(wall(), 200)])
+    stray = torch.cat([cameras().repeat(3, 1), torch.tensor([[1000.0, 1000.0, 0.0]])])
+    config = GroundConfig(spacing=0.04)
+    largest = 0
+    query = KDTree.query
+
+    def counted(tree, places, *arguments, **options):
+        nonlocal largest
+        largest = max(largest, len(places))
+        return query(tree, places, *arguments, **options)
+
+    monkeypatch.setattr(KDTree, "query", counted)
+    filled, _ = ground_points(points, colors, stray, config)
+    assert largest <= 2_000_000
+    middle = filled[filled[:, :2].norm(dim=1) < 0.45]
+    assert len(middle) > 0.8 * 3.14 * 0.45**2 / config.spacing**2

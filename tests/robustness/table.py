@@ -39,7 +39,7 @@ _MODEL: dict[str, Cell] = {
     "full disk": _UNWRITTEN,
     "link loop": ("error", "no COLMAP model", "error: no model"),
 }
-_BAD_MASK = ("error", r"masks.p02\.png.*mend the mask or remove it", "error: mend or remove it")
+_BAD_MASK = ("error", r"masks.p02\.png.*repair the mask or remove it", "error: repair or remove it")
 _BAD_DEPTH = ("left out", r"depth.p02\.png.*trains without depth", "photo trains without depth")
 _NOT_WRITTEN: dict[str, Cell] = {
     "read-only": ("error", "cannot be written", "error"),

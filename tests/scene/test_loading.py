@@ -1,4 +1,5 @@
 import logging
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -379,3 +380,53 @@ def test_liberty_loads(shared: Path) -> None:
     # Half of the points lie within the unit of depth, and the statue stands upright: z is its longest side.
     spread = scene.points.quantile(0.9, dim=0) - scene.points.quantile(0.1, dim=0)
     assert spread.argmax().item() == 2
+
+
+def test_a_mask_may_have_the_photos_own_name(make_scene: MakeScene) -> None:
+    root = make_scene(names=["x.jpg", "y.jpg"])
+    (root / "masks").mkdir()
+    Image.new("L", (W, H), 0).save(root / "masks" / "x.jpg")
+    first, second = load_scene(root, DataConfig(holdout=0)).views
+    mask = first.read_mask()
+    assert mask is not None
+    assert not mask.any()
+    assert second.read_mask() is None
+
+
+def test_masks_of_no_photo_are_said(make_scene: MakeScene) -> None:
+    root = make_scene(3)
+    (root / "masks").mkdir()
+    load_scene(root)
+    Image.new("L", (W, H), 0).save(root / "masks" / "other.png")
+    with pytest.warns(WildGSWarning, match=r"none of its files is named after a photo.*p00\.png\.png"):
+        load_scene(root)
+    load_scene(root, DataConfig(use_masks=False))
+
+
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero"])
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_split_that_never_ends_is_refused(make_scene: MakeScene, target: str) -> None:
+    root = make_scene(3)
+    if target == "pipe":
+        os.mkfifo(root / "split.tsv")
+    else:
+        (root / "split.tsv").symlink_to(target)
+    with pytest.raises(UserError, match=r"split\.tsv.*not a regular file"):
+        load_scene(root)
+
+
+def test_names_as_long_as_the_file_system_takes(make_scene: MakeScene) -> None:
+    """`masks/<name>.png` is longer than a name can be."""
+    name = "x" * 250 + ".png"
+    scene = load_scene(make_scene(names=[name, "b.png"]), DataConfig(holdout=0))
+    assert [view.name for view in scene.views] == ["b.png", name]
+    assert scene.views[1].read_mask() is None
+
+
+def test_observations_are_those_of_the_model(make_scene: MakeScene) -> None:
+    root = make_scene(4)
+    (root / "images" / "p01.png").unlink()
+    with pytest.warns(WildGSWarning, match=r"p01\.png"):
+        scene = load_scene(root)
+    pairs = {tuple(pair) for pair in scene.observations.tolist()}
+    assert pairs == {(view, point) for view in range(3) for point in range(60)}

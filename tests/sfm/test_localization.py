@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -242,3 +244,18 @@ def test_the_ratio_test_looks_at_other_points_only() -> None:
     matched, seen = match_features(features, known, 0.8)
     assert list(matched) == [0]
     assert list(seen) == [0]
+
+
+def test_models_and_photos_are_read_in_python(
+    corner_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP's own reader believes what files declare, and reads rigs and frames as well."""
+    shutil.copytree(corner_scene, tmp_path / "scene")
+    model = tmp_path / "scene/sparse/0"
+    for name in ("rigs.bin", "frames.bin"):
+        assert (model / name).is_file()
+        (model / name).write_bytes(struct.pack("<Q", 2**60))
+    monkeypatch.setattr(pycolmap, "Reconstruction", lambda *_: pytest.fail("read by COLMAP"))
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *_: pytest.fail("photos read by COLMAP"))
+    index = load_feature_index(load_scene(tmp_path / "scene", DataConfig(holdout=0)))
+    assert len(index.descriptors) > 500

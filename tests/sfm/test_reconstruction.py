@@ -1,4 +1,8 @@
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +13,7 @@ from PIL import Image
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.colmap import read_model
+from wildgs.sfm import reconstruction
 from wildgs.sfm.reconstruction import PairingConfig, SfmConfig, reconstruct
 
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
@@ -58,7 +63,10 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     (folder / "notes.txt").write_text("no photo")
 
     steps: list[tuple[str, int, int]] = []
-    with pytest.warns(WildGSWarning, match=r"broken\.jpg: .*left out"):
+    with (
+        pytest.warns(WildGSWarning, match=r"broken\.jpg: .*left out"),
+        pytest.warns(WildGSWarning, match=r"not used: notes\.txt"),
+    ):
         report = reconstruct(folder, tmp_path / "scene", progress=lambda *step: steps.append(step))
 
     names = ["phone/photo 3.jpg", "photo 0.jpg", "photo 1.jpg", "photo 2.jpg", "photo 4.jpg", "photo 5.jpg"]
@@ -124,6 +132,124 @@ def test_an_existing_scene_is_replaced_only_on_demand(tmp_path: Path, corner: Co
     assert (output / "keep.txt").read_text() == "the user's"
     assert len(load_scene(output).views) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "p"]
+
+
+def test_names_that_phones_and_old_disks_write(tmp_path: Path, corner: Corner) -> None:
+    """Copies under plain names inside, the user's names outside."""
+    (tmp_path / "p").mkdir()
+    names = [b"2023-07-14 18:22:31.jpg", b"caf\xe9.jpg", b"line\nbreak.jpg", b"IMG_7"]
+    for name, pixels in zip(names, corner[0], strict=False):
+        path = tmp_path / "p" / os.fsdecode(name)
+        Image.fromarray(pixels).save(path, "JPEG", quality=95)
+    (tmp_path / "p" / os.fsdecode(b"br\xffken.jpg")).write_bytes(b"no photo")
+    with pytest.warns(WildGSWarning, match=r"br\\xffken\.jpg: not a readable picture"):
+        report = reconstruct(tmp_path / "p", tmp_path / os.fsdecode(b"sc\xe8ne"))
+    expected = ("2023-07-14 18:22:31.jpg", "IMG_7.jpg", "caf_.jpg", "line_break.jpg")
+    assert report.registered == expected
+    "\n".join(report.lines()).encode()  # can be printed
+    assert any(r"caf\xe9.jpg: caf_.jpg" in line for line in report.lines())
+    scene = load_scene(tmp_path / os.fsdecode(b"sc\xe8ne"))
+    assert tuple(view.name for view in scene.views) == expected
+    assert all(view.read_photo().float().std() > 5 for view in scene.views)
+    stored = json.loads((scene.root / "sfm_report.json").read_text(encoding="utf-8"))
+    assert stored["renamed"] == {"caf\udce9.jpg": "caf_.jpg", "line\nbreak.jpg": "line_break.jpg"}
+    assert list(stored["left_out"]) == [os.fsdecode(b"br\xffken.jpg")]
+
+
+@pytest.fixture
+def old_scene(tmp_path: Path) -> Path:
+    """A scene of an earlier run, with depth that was estimated and a mask that somebody drew."""
+    output = tmp_path / "out"
+    for name in ("images/old.jpg", "sparse/0/cameras.bin", "depth/old.png", "masks/a.png", "masks/drawn.png"):
+        (output / name).parent.mkdir(parents=True, exist_ok=True)
+        (output / name).write_text("old")
+    (output / "sfm_report.json").write_text(json.dumps({"masks": ["a.png"]}))
+    return output
+
+
+@pytest.fixture
+def new_scene(tmp_path: Path) -> Path:
+    work = tmp_path / "work"
+    for name in ("images/new.jpg", "sparse/0/cameras.bin", "sfm_report.json"):
+        (work / name).parent.mkdir(parents=True, exist_ok=True)
+        (work / name).write_text("new")
+    return work
+
+
+def content(folder: Path) -> dict[str, str]:
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_what_belonged_to_the_replaced_scene_is_set_aside(old_scene: Path, new_scene: Path) -> None:
+    """Depth and masks of other photos would be read as the new ones'."""
+    with pytest.warns(
+        WildGSWarning, match=r"depth_replaced/ and masks_replaced/ belonged to the replaced scene"
+    ):
+        reconstruction._move_in(new_scene, old_scene)
+    assert content(old_scene) == {
+        "images/new.jpg": "new",
+        "sparse/0/cameras.bin": "new",
+        "sfm_report.json": "new",
+        "depth_replaced/old.png": "old",
+        "masks_replaced/a.png": "old",
+        "masks_replaced/drawn.png": "old",
+    }
+
+
+def test_masks_of_the_replaced_scene_itself_go_with_it(old_scene: Path, new_scene: Path) -> None:
+    (old_scene / "masks/drawn.png").unlink()
+    (old_scene / "depth/old.png").unlink()
+    (old_scene / "depth").rmdir()
+    reconstruction._move_in(new_scene, old_scene)
+    assert set(content(old_scene)) == {"images/new.jpg", "sparse/0/cameras.bin", "sfm_report.json"}
+
+
+@pytest.mark.parametrize("failing", range(1, 9))
+@pytest.mark.parametrize("error", [OSError("disk"), KeyboardInterrupt()])
+def test_a_replacement_that_fails_leaves_the_old_scene(
+    old_scene: Path, new_scene: Path, monkeypatch: pytest.MonkeyPatch, failing: int, error: BaseException
+) -> None:
+    before, rename, calls = content(old_scene), Path.rename, [0]
+
+    def fail(path: Path, target: Path) -> Path:
+        calls[0] += 1
+        if calls[0] == failing:
+            raise error
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", fail)
+    with pytest.raises(type(error)):
+        reconstruction._move_in(new_scene, old_scene)
+    assert content(old_scene) == before
+
+
+def test_a_replacement_that_was_killed_is_undone(old_scene: Path, new_scene: Path) -> None:
+    before = content(old_scene)
+    aside = old_scene / ".replaced"
+    aside.mkdir()
+    for name in ("images", "depth"):
+        (old_scene / name).rename(aside / name)
+    (new_scene / "images").rename(old_scene / "images")
+    reconstruction._restore(old_scene)
+    assert content(old_scene) == before
+
+
+@pytest.mark.parametrize(
+    ("number", "stage"), [(signal.SIGTERM, "finding features"), (signal.SIGHUP, "finding poses")]
+)
+def test_signals_leave_nothing_behind(tmp_path: Path, corner: Corner, number: int, stage: str) -> None:
+    """A scheduler's SIGTERM, a terminal that is closed: no stack of C++, no copies of the photos."""
+    photos = save_photos(tmp_path / "p", corner[0][:4])
+    code = (
+        "import os, sys; from pathlib import Path; from wildgs.cli import sfm\n"
+        "from wildgs.sfm import reconstruction\n"
+        f"def progress(stage, done, total): stage == {stage!r} and os.kill(os.getpid(), {int(number)})\n"
+        f"reconstruction.reconstruct(Path({str(photos)!r}), Path({str(tmp_path / 'out')!r}), progress=progress)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
+    assert "TerminatedError: terminated" in ended.stderr
+    assert "***" not in ended.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["p"]
 
 
 def test_folders_of_others_are_never_written_over(tmp_path: Path, corner: Corner) -> None:

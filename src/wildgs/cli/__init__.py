@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import logging
 import os
 import sys
@@ -45,6 +46,9 @@ logger.addHandler(logging.NullHandler())  # or Python prints what is logged a se
 def main(arguments: list[str] | None = None) -> None:
     """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 or 143 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    for stream in (sys.stdout, sys.stderr):  # names are bytes, and not all of them are text
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         _dispatch(arguments)
     except ReportedError:

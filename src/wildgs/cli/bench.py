@@ -57,7 +57,7 @@ class Command:
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run each."""
     lpips: Path | None = None
-    """Folder with LPIPS weights, where they are not in torch's cache."""
+    """Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet."""
     data: Annotated[DataConfig, UNNAMED] = field(default_factory=DataConfig)
     model: Annotated[WildGSConfig, UNNAMED] = field(default_factory=WildGSConfig)
     train: Annotated[TrainConfig, UNNAMED] = field(default_factory=TrainConfig)

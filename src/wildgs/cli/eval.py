@@ -28,7 +28,7 @@ class Command:
     scene: Path | None = None
     """The scene folder, where it is not where it was when the run was trained."""
     lpips: Path | None = None
-    """Folder with LPIPS weights, where they are not in torch's cache."""
+    """Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet."""
 
 
 def run(command: Command) -> None:

@@ -9,6 +9,7 @@ import tyro
 
 from wildgs.cli.screen import console
 from wildgs.files import printable
+from wildgs.processes import signals_as_interrupts
 from wildgs.viewer.config import ServerConfig, ViewerConfig
 
 
@@ -31,11 +32,12 @@ def run(command: Command) -> None:
     """Serves the page until interrupted."""
     import wildgs
 
-    opened = wildgs.view(
-        command.run, appearance=command.appearance, server=command.server, viewer=command.viewer
-    )
-    for url in opened.urls:
-        console.print(f"{printable(str(command.run))}: {url}")
-    console.print("Ctrl-C ends the viewer")
-    opened.stay()
+    with signals_as_interrupts():
+        opened = wildgs.view(
+            command.run, appearance=command.appearance, server=command.server, viewer=command.viewer
+        )
+        for url in opened.urls:
+            console.print(f"{printable(str(command.run))}: {url}", markup=False)
+        console.print("Ctrl-C ends the viewer")
+        opened.stay()
     console.print("closed")

@@ -18,8 +18,8 @@ class ScheduleConfig:
         first_stage: Steps without triplane and depth loss, until the mask is useful.
         densify_from: First densification (3DGS: 500).
         densify_until: Last densification and reset (3DGS: 15,000).
-        densify_every: Between densifications (3DGS: 100).
-        reset_every: Between opacity resets (3DGS: 3,000).
+        densify_every: Between densifications (3DGS: 100); 0 = no densification, pruning and opacity resets.
+        reset_every: Between opacity resets (3DGS: 3,000); 0 = no resets.
         mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
@@ -34,6 +34,13 @@ class ScheduleConfig:
     mask_pause: int = 500
     sh_every: int = 1000
     encoder_every: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuses negative steps, and 0 where it means nothing."""
+        for name, value in vars(self).items():
+            least = 1 if name in ("sh_every", "encoder_every") else 0
+            if value < least:
+                raise UserError(f"schedule.{name} {value}: must be {least} or more")
 
 
 @dataclass(frozen=True)

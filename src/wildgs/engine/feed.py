@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -25,12 +25,20 @@ class PhotoFeed:
         batch: Names of the photos that all ranks train on now.
     """
 
-    def __init__(self, views: Sequence[View], sampler: ViewSampler, team: Team, device: torch.device) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        sampler: ViewSampler,
+        team: Team,
+        device: torch.device,
+        observations: Mapping[str, Float[Tensor, "_ 2"]] | None = None,
+    ) -> None:
         self.views = views
         self.sampler = sampler
         self.team = team
         self.device = device
         self.batch = ""
+        self._observations = {name: pixels.to(device) for name, pixels in (observations or {}).items()}
         self._unreadable: set[str] = set()
         self._cameras: dict[str, Camera] = {}
 
@@ -81,6 +89,10 @@ class PhotoFeed:
         """The depth prior, where there is one."""
         disparity = view.read_disparity()
         return None if disparity is None else upload(disparity, self.device)
+
+    def observations(self, view: View) -> Float[Tensor, "K 2"] | None:
+        """Pixels (x, y) at which the photo shows triangulated points, where that is known."""
+        return self._observations.get(view.name)
 
     def camera(self, view: View) -> Camera:
         """The camera, carried to the device once."""

@@ -14,7 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import written_aside
+from wildgs.files import printable, written_aside
 
 
 class Recorder:
@@ -37,6 +37,11 @@ class Recorder:
         self.scalars_every = scalars_every
         self.pictures_every = pictures_every
         lines = folder / "metrics.jsonl"
+        if printable(str(folder)) != str(folder):
+            raise UserError(
+                f"{printable(str(folder))}: TensorBoard cannot write to paths that are not UTF-8 or hold control"
+                " characters; choose another --output"
+            )
         try:
             folder.mkdir(parents=True, exist_ok=True)
             _keep_until(lines, step)

@@ -38,8 +38,11 @@ class Schedule:
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
         self.densify_until = self._scaled(config.densify_until, "densify_until")
-        self.densify_every = self._scaled(config.densify_every, "densify_every")
-        self.reset_every = self._scaled(config.reset_every, "reset_every")
+        self.densify_every = (
+            self._scaled(config.densify_every, "densify_every") if config.densify_every else 0
+        )
+        resets = config.densify_every and config.reset_every
+        self.reset_every = self._scaled(config.reset_every, "reset_every") if resets else 0
         self.mask_pause = self._scaled(config.mask_pause, "mask_pause")
         self.sh_every = self._scaled(config.sh_every, "sh_every")
 
@@ -71,21 +74,24 @@ class Schedule:
 
     def mask_paused(self, step: int) -> bool:
         """Whether an opacity reset lies less than `mask_pause` steps back."""
+        if not self.reset_every:
+            return False
         last = min(step, self.densify_until - 1) // self.reset_every * self.reset_every
         return last > 0 and step - last < self.mask_pause
 
     def densifies(self, step: int, taken: int = 1) -> bool:
         """Whether the Gaussians are densified after this step, which counted for `taken`."""
-        due = falls_on(step, taken, self.densify_every)
+        due = self.densify_every > 0 and falls_on(step, taken, self.densify_every)
         return self.densify_from < step < self.densify_until and due
 
     def resets(self, step: int, taken: int = 1) -> bool:
         """Whether opacities are reset after this step, which counted for `taken`."""
-        return 0 < step < self.densify_until and falls_on(step, taken, self.reset_every)
+        due = self.reset_every > 0 and falls_on(step, taken, self.reset_every)
+        return 0 < step < self.densify_until and due
 
     def gathers(self, step: int) -> bool:
         """Whether screen statistics are still needed."""
-        return step < self.densify_until
+        return self.densify_every > 0 and step < self.densify_until
 
 
 def falls_on(step: int, taken: int, every: int) -> bool:

@@ -22,7 +22,9 @@ from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
+from wildgs.model.feature_cache import FeatureCache
 from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.parsing import keep_features
 from wildgs.model.precision import (
     choose_precision,
     lay_out_channels_last,
@@ -31,8 +33,10 @@ from wildgs.model.precision import (
 )
 from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
+from wildgs.scene.scene import observed_pixels
 
 PREPARATION_PHOTOS = 16
+FEATURE_CACHE_BYTES = 10**9
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,7 @@ class Trainer:
 
     Attributes:
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
+        feature_cache: Bytes for the features that a frozen encoder gave of training photos.
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
@@ -116,10 +121,11 @@ class Trainer:
         self.density = DensityControl(config.density, extent, len(method.gaussians), self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
-        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device)
+        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
         self._process = ProcessSettings(self.device)
         self.cuda_graphs = True
+        self.feature_cache = FEATURE_CACHE_BYTES
 
     def run(self, observers: Sequence[Observer] = ()) -> None:
         """Trains until `config.steps`; every observer is called after every step.
@@ -151,11 +157,13 @@ class Trainer:
         self.team.share(self.method.state_dict().values())
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
+        keep_features(self.method, FeatureCache(self.feature_cache))
 
     def end(self) -> None:
         """Undoes `begin`: the method in float32 without graphs, the process's settings as they were before."""
         set_precision(self.method, torch.float32)
         switch_replays(self.method, False)
+        keep_features(self.method, None)
         self._process.end()
 
     def advance(self) -> StepReport:
@@ -196,7 +204,7 @@ class Trainer:
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep)
+        output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
             self._objective,
@@ -208,6 +216,7 @@ class Trainer:
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
+            observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
         )
         return output, losses
@@ -218,7 +227,7 @@ class Trainer:
         if self.schedule.resets(self.step, taken):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
         if self.schedule.densifies(self.step, taken):
-            large = self.step > self.schedule.reset_every
+            large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
                 self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
             )

@@ -1,29 +1,36 @@
-"""LPIPS v0.1 (Zhang et al. 2018) in plain torch: AlexNet and SqueezeNet 1.1, calibrated linear layers."""
+"""LPIPS v0.1 (Zhang et al. 2018) in plain torch: SqueezeNet 1.1 from the package, or AlexNet from a folder."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
+
+from wildgs.model.squeezenet import LPIPS_TAPS, LPIPS_WIDTHS, packaged_weights, squeezenet_layers
 
 Network = Literal["alex", "squeeze"]
 MIN_SIDE = 32
 """Smallest side in pixels for which the deepest layer of both backbones is not empty."""
+ENVIRONMENT = "WILDGS_LPIPS"
+"""A folder with a backbone and its linear layers, or ``off`` for no LPIPS at all."""
 
 # Normalisation of inputs in [-1, 1], from LPIPS.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
+_BACKBONE_NAMES: dict[Network, str] = {"alex": "alexnet*.pth", "squeeze": "squeezenet1_1*.pth"}
+_TITLES: dict[Network, str] = {"alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
 
 
 class LPIPS(nn.Module):
     """Learned perceptual distance of two pictures.
 
     Features after each tapped ReLU are normalised to unit length over the channels; squared differences are
-    weighted by the linear layer and averaged over the picture. `wildgs.evaluation.lpips_weights` loads the weights.
+    weighted by the linear layer and averaged over the picture.
     """
 
     shift: Tensor
@@ -32,7 +39,10 @@ class LPIPS(nn.Module):
     def __init__(self, network: Network) -> None:
         super().__init__()
         self.network: Network = network
-        self.features, self.taps, widths = _alexnet() if network == "alex" else _squeezenet()
+        if network == "alex":
+            self.features, self.taps, widths = _alexnet_layers(), (1, 4, 7, 9, 11), (64, 192, 384, 256, 256)
+        else:
+            self.features, self.taps, widths = squeezenet_layers(), LPIPS_TAPS, LPIPS_WIDTHS
         self.linear = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in widths])
         self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None], persistent=False)
@@ -55,12 +65,12 @@ class LPIPS(nn.Module):
         for i, weight in enumerate(self.linear):
             given = linear.get(f"lin{i}.model.1.weight")
             if given is None or given.numel() != weight.numel():
-                raise RuntimeError(f"linear layer {i} is missing or does not have {weight.numel()} channels")
+                raise RuntimeError(f"linear layer {i} is missing or not of {weight.numel()} channels")
             weight.copy_(given.flatten())
 
     @torch.no_grad()
     def forward(self, first: UInt8[Tensor, "H W 3"], second: UInt8[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Distance of two pictures: 0 if they are equal, about 0.7 if they are unrelated.
+        """The distance: 0 for equal pictures, about 0.7 for unlike ones.
 
         Raises:
             ValueError: A side is shorter than `MIN_SIDE` pixels.
@@ -79,23 +89,66 @@ class LPIPS(nn.Module):
         return distance
 
 
-class _Fire(nn.Module):
-    """Fire module of SqueezeNet, with the parameter names of torchvision."""
+def load_lpips(folder: Path | None = None) -> tuple[LPIPS | None, str]:
+    """The network, and a line for the notes that says which one it is, or why there is none.
 
-    def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
-        super().__init__()
-        self.squeeze = nn.Conv2d(inputs, squeezed, 1)
-        self.expand1x1 = nn.Conv2d(squeezed, expanded, 1)
-        self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
+    Args:
+        folder: Holds a backbone with its linear layers, AlexNet's or SqueezeNet's. None takes the folder that
+            `WILDGS_LPIPS` names, and without that setting the SqueezeNet of the package.
+    """
+    setting = os.environ.get(ENVIRONMENT, "").strip()
+    if folder is None and setting.lower() == "off":
+        return None, f"LPIPS is null: {ENVIRONMENT} is off"
+    if folder is None and setting:
+        folder = Path(setting).expanduser()
+    if folder is None:
+        model = LPIPS("squeeze")
+        model.load(*packaged_weights())
+        return model, _title(model)
+    return _load_from(folder)
 
-    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
-        x = F.relu(self.squeeze(x))
-        return torch.cat([F.relu(self.expand1x1(x)), F.relu(self.expand3x3(x))], dim=1)
+
+def _load_from(folder: Path) -> tuple[LPIPS | None, str]:
+    found = _find_in(folder)
+    if found is None:
+        return None, (
+            f"LPIPS is null: {folder} contains no backbone (alexnet*.pth or squeezenet1_1*.pth) "
+            "with linear layers (linear.pth, alex.pth or squeeze.pth)"
+        )
+    network, backbone, linear = found
+    model = LPIPS(network)
+    try:
+        model.load(_read(backbone), _read(linear))
+    except (
+        Exception
+    ) as error:  # unpickling raises errors of many kinds; scores without LPIPS beat none at all
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        return None, f"LPIPS is null: cannot load {backbone} or {linear} ({reason})"
+    return model, _title(model)
 
 
-def _alexnet() -> tuple[nn.Sequential, tuple[int, ...], tuple[int, ...]]:
-    """Layers as in torchvision, indices of the tapped layers, and their widths."""
-    features = nn.Sequential(
+def _find_in(folder: Path) -> tuple[Network, Path, Path] | None:
+    """A backbone and its linear layers; AlexNet's before SqueezeNet's."""
+    for network, pattern in _BACKBONE_NAMES.items():
+        backbone = next(iter(sorted(folder.glob(pattern))), None)
+        names = (f"lpips_{network}.pth", f"{network}.pth", "linear.pth")
+        linear = next((folder / name for name in names if (folder / name).is_file()), None)
+        if backbone is not None and linear is not None:
+            return network, backbone, linear
+    return None
+
+
+def _read(file: Path) -> dict[str, Any]:
+    return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _title(model: LPIPS) -> str:
+    return f"LPIPS v0.1 with {_TITLES[model.network]} ({model.network})"
+
+
+def _alexnet_layers() -> nn.Sequential:
+    """Layers at torchvision's positions."""
+    return nn.Sequential(
         nn.Conv2d(3, 64, 11, stride=4, padding=2),
         nn.ReLU(),
         nn.MaxPool2d(3, stride=2),
@@ -109,24 +162,3 @@ def _alexnet() -> tuple[nn.Sequential, tuple[int, ...], tuple[int, ...]]:
         nn.Conv2d(256, 256, 3, padding=1),
         nn.ReLU(),
     )
-    return features, (1, 4, 7, 9, 11), (64, 192, 384, 256, 256)
-
-
-def _squeezenet() -> tuple[nn.Sequential, tuple[int, ...], tuple[int, ...]]:
-    """Layers as in torchvision, indices of the tapped layers, and their widths."""
-    features = nn.Sequential(
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, stride=2, ceil_mode=True),
-        _Fire(64, 16, 64),
-        _Fire(128, 16, 64),
-        nn.MaxPool2d(3, stride=2, ceil_mode=True),
-        _Fire(128, 32, 128),
-        _Fire(256, 32, 128),
-        nn.MaxPool2d(3, stride=2, ceil_mode=True),
-        _Fire(256, 48, 192),
-        _Fire(384, 48, 192),
-        _Fire(384, 64, 256),
-        _Fire(512, 64, 256),
-    )
-    return features, (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512)

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.evaluation.lpips import LPIPS, MIN_SIDE
-from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.lpips import LPIPS, MIN_SIDE, load_lpips
 from wildgs.evaluation.metrics import MaskScore, psnr, structural_similarity, to_8bit
 from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
 from wildgs.model.method import Method
@@ -80,7 +79,7 @@ def evaluate(
         run: Run folder.
         step: Training steps of `method`, for the record.
         train_seconds: Training time, for the record.
-        lpips_folder: Folder of LPIPS weights; by default as in `find_lpips`.
+        lpips_folder: Folder of LPIPS weights; by default as in `load_lpips`.
         mask_threshold: Threshold Th for the intersection over union of masks.
         on_view: Called with the name of each finished view.
 

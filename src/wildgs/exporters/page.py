@@ -21,7 +21,7 @@ from torch import Tensor
 
 from wildgs.exporters.page_scene import PackedScene, pack_scene
 from wildgs.exporters.splats import Splats
-from wildgs.files import written_aside
+from wildgs.files import printable, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
 
@@ -134,8 +134,8 @@ def _compose(page: Page, scene: PackedScene) -> str:
         "lights": [{"name": light.name, "thumbnail": _thumbnail(light.thumbnail)} for light in page.lights],
     }
     return Template(web.joinpath("page.html").read_text(encoding="utf-8")).substitute(
-        title=escape(page.title),
-        summary=escape(page.summary),
+        title=escape(printable(page.title)),
+        summary=escape(printable(page.summary)),
         style=web.joinpath("style.css").read_text(encoding="utf-8"),
         licenses=escape(web.joinpath("LICENSES.txt").read_text(encoding="utf-8")),
         header=script_json(header),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -17,7 +17,7 @@ from PIL import Image
 
 from wildgs.exporters.depth_colors import color_depth
 from wildgs.exporters.report_scores import MethodScores, scores_section
-from wildgs.files import written_aside
+from wildgs.files import printable, written_aside
 
 __all__ = ["MethodScores", "Report", "ReportExample", "write_report"]
 
@@ -68,6 +68,11 @@ class Report:
     summary: str
     methods: tuple[MethodScores, ...] = ()
     examples: tuple[ReportExample, ...] = ()
+
+
+def escape(text: str) -> str:
+    """Text as HTML; characters of file names that a page cannot hold, as escapes."""
+    return html.escape(printable(text))
 
 
 def write_report(report: Report, file: Path) -> None:

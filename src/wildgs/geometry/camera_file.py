@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from wildgs.errors import UserError
-from wildgs.files import written_aside
+from wildgs.files import check_regular, written_aside
 from wildgs.geometry.camera import Camera
 
 Frame = Literal["scene", "colmap"]
@@ -73,6 +73,7 @@ def read_camera_path(file: Path) -> CameraPath:
         UserError: The file is missing or not a valid camera file; the message names the entry.
     """
     try:
+        check_regular(file)
         content = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise UserError(f"{file}: no such file; give a camera file or one of the built-in paths") from error

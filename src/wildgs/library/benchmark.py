@@ -21,7 +21,7 @@ from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
 from wildgs.evaluation.benchmark_table import to_csv, to_markdown, to_records
-from wildgs.evaluation.lpips_weights import load_lpips
+from wildgs.evaluation.lpips import load_lpips
 from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
@@ -109,7 +109,7 @@ def benchmark(
         variants: Further lines, ``NAME:KEY=VALUE[,KEY=VALUE...]``: Wild-GS with entries of config.yaml changed.
         seeds: One run each.
         suite: `phototourism` compares with the paper's figures on its three scenes.
-        lpips: Folder with LPIPS weights, where they are not in torch's cache.
+        lpips: Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet.
         execution: How runs are executed.
         progress: Called during all stages of all runs.
         observers: Called with a `StepReport` after every training step.

@@ -188,9 +188,10 @@ def _pycolmap() -> Check:
 
 
 def _encoder_weights() -> Check:
-    from wildgs.model.encoder import RESNET18
+    from wildgs.model.encoder import load_encoder
 
-    return _hub_weights("encoder weights", RESNET18, "masks and embeddings start from scratch and are weaker")
+    load_encoder()
+    return Check("encoder weights", "works", "SqueezeNet 1.1, part of the package")
 
 
 def _depth_weights() -> Check:
@@ -211,14 +212,10 @@ def _hub_weights(name: str, repository: str, loss: str) -> Check:
 
 
 def _lpips() -> Check:
-    from wildgs.evaluation.lpips_weights import find_lpips, how_to_get_lpips, load_lpips
+    from wildgs.evaluation.lpips import load_lpips
 
-    name = "LPIPS weights"
-    if find_lpips() is None:
-        detail = "not at hand; fetched by the first `wildgs eval`, and where that fails LPIPS is null"
-        return Check(name, "missing", detail, how_to_get_lpips())
-    model, note = load_lpips(download=False)
-    return Check(name, "works" if model is not None else "broken", note)
+    model, note = load_lpips()
+    return Check("LPIPS weights", "works" if model is not None else "broken", note)
 
 
 def _viewer() -> Check:

@@ -34,7 +34,7 @@ def evaluate(
         protocols: `full` takes a view's light from the whole photo and scores the whole frame; `half` takes it from
             the left half and scores the right one.
         scene: The scene folder, where it moved since training, or the scene read from it.
-        lpips: Folder with LPIPS weights, where they are not in torch's cache.
+        lpips: Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet.
         progress: Called for every photo read and every view scored.
 
     Raises:

@@ -36,6 +36,7 @@ from wildgs.runs import (
     save_run,
 )
 from wildgs.scene import Scene, load_scene
+from wildgs.scene.config import parse_bytes
 
 LEAST_SECONDS_ON_CUDA = 60.0
 """Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
@@ -248,6 +249,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             progress=counter(job.progress, "copying photos to the run"),
         )
         trainer.cuda_graphs = job.execution.cuda_graphs
+        trainer.feature_cache = parse_bytes(job.execution.feature_cache)
         with ExitStack() as stack:
             if job.team.first:
                 observers = [stack.enter_context(open_one(trainer, job.scene)) for open_one in job.attach]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.losses.depth import depth_correlation
+from wildgs.losses.evidence import proven_static
 from wildgs.losses.photometric import masked_photometric
 from wildgs.losses.visibility import visibility_regularizer
 
@@ -52,6 +53,7 @@ def total_loss(
     depth: Float[Tensor, "H W"] | None = None,
     alpha: Float[Tensor, "H W"] | None = None,
     disparity: Float[Tensor, "H W"] | None = None,
+    observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
 ) -> Losses:
     """The paper's L_total for one photo.
@@ -66,6 +68,8 @@ def total_loss(
         depth: Rendered expected depth; the depth loss needs it and `disparity`.
         alpha: Accumulated alpha of the render; pixels below `min_alpha` are left out of the depth loss.
         disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
+        observations: Pixels (x, y) at which the photo shows triangulated points: the mask learns that these are
+            static.
         train_mask: False passes no gradient to the mask (the pause after an opacity reset).
 
     Returns:
@@ -73,7 +77,9 @@ def total_loss(
     """
     if visibility is not None and not train_mask:
         visibility = visibility.detach()
-    image = masked_photometric(photo, render, _kept(visibility, keep, photo), config.weight_l1)
+    proven = None if observations is None else proven_static(observations, *photo.shape[:2])
+    kept = _kept(visibility, keep, photo)
+    image = masked_photometric(photo, render, kept, config.weight_l1, proven=proven)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from wildgs.errors import UserError
 from wildgs.priors.config import DepthPointsConfig, GroundConfig
 
+SQUEEZENET = "squeezenet"
+"""The encoder that ships with the package."""
 RESNET18 = "microsoft/resnet-18"
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -15,12 +18,24 @@ Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "l
 """Parts that can be taken away: the paper's five, and the intrinsic and local features."""
 
 
+WRAPPING_RANGES = {
+    "resolution": (4, 1024),
+    "features": (1, 512),
+    "local_size": (1, 512),
+    "crop_ratio": (0.01, 1.0),
+    "box_quantile": (0.0, 0.25),
+    "partial_lifts": (0.0, 1.0),
+}
+"""Smallest and largest values; at 1024 cells a side the planes take some GB."""
+
+
 @dataclass(frozen=True)
 class ParsingConfig:
     """2D Parsing.
 
     Attributes:
-        encoder: ResNet-18's folder or hub name.
+        encoder: `squeezenet` for the frozen features that ship with the package; else a ResNet-18 that learns: its
+            folder or hub name (paper: `microsoft/resnet-18`).
         max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
             anyway, and cost grows with the square.
         color_statistics: Whether M^G also reads mean and spread of the photo's own colours. Not in the paper; but
@@ -29,7 +44,7 @@ class ParsingConfig:
         decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
     """
 
-    encoder: str = RESNET18
+    encoder: str = SQUEEZENET
     max_side: int = 256
     color_statistics: bool = True
     global_size: int = 16
@@ -52,13 +67,22 @@ class WrappingConfig:
             show get whatever light comes out.
     """
 
-    resolution: int = 128
+    resolution: int = 64
     features: int = 32
     widths: tuple[int, ...] = (16, 32, 64, 64)
     local_size: int = 16
     crop_ratio: float = 0.5
     box_quantile: float = 0.005
     partial_lifts: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuses planes that no memory holds, and shares that are none."""
+        for name, (least, most) in WRAPPING_RANGES.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise UserError(f"wrapping.{name} {value}: must be from {least:g} to {most:g}")
+        if not 1 <= len(self.widths) <= 8 or not all(1 <= width <= 1024 for width in self.widths):
+            raise UserError(f"wrapping.widths {self.widths}: must be 1 to 8 numbers from 1 to 1024")
 
 
 @dataclass(frozen=True)

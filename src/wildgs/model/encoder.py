@@ -1,8 +1,9 @@
-"""The ResNet-18 that 2D Parsing reads photos with (paper, appendix B)."""
+"""Encoders of 2D Parsing: frozen SqueezeNet features, or the ResNet-18 of the paper's appendix B, which learns."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,14 +14,20 @@ from torch.nn import functional
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.hub import hub_reachable
-from wildgs.model.config import RESNET18
+from wildgs.model.config import RESNET18, SQUEEZENET
+from wildgs.model.squeezenet import packaged_weights, squeezenet_layers
 
 if TYPE_CHECKING:
     from transformers import ResNetModel
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-FEATURE_WIDTHS = (64, 64, 128, 256, 512)
+RESNET_WIDTHS = (64, 64, 128, 256, 512)
+SQUEEZENET_LEVELS = (4, 7, 9, 12)
+"""Layers whose features are read, at 1/4, 1/8, 1/16 and 1/16 of the resolution."""
+SQUEEZENET_WIDTHS = (128, 256, 384, 512)
+LEAST_VARIANCE = 1e-4
+"""Of a level over the collection: what hardly varies (blank photos) is not amplified further."""
 
 
 class FrozenBatchNorm(nn.Module):
@@ -65,14 +72,99 @@ class FrozenBatchNorm(nn.Module):
 
 
 class Encoder(nn.Module):
-    """ResNet-18 without its classifier; gives the feature maps of the stem and the four stages.
+    """Feature maps of photos.
 
     Attributes:
+        widths: Channels of the maps that `forward` gives.
+        frozen: Whether the network never learns: features of a photo can then be kept (`FeatureCache`).
         pretrained: Whether the weights are ImageNet's.
     """
 
+    widths: tuple[int, ...]
+    frozen: bool = False
+    pretrained: bool = True
     mean: Tensor
     std: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
+
+    def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Feature maps from fine to coarse; the last four are at 1/4, 1/8, 1/16 and 1/16 or less of the resolution.
+
+        Args:
+            images: RGB in [0, 1].
+        """
+        raise NotImplementedError
+
+    def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
+        """Sets the normalisation statistics of the features from photos of the collection, once."""
+
+
+class SqueezeNetEncoder(Encoder):
+    """Frozen SqueezeNet 1.1: four levels of ImageNet features, standardised over the collection.
+
+    The network's weights come with the package and are no part of a checkpoint; the statistics are.
+    """
+
+    widths = SQUEEZENET_WIDTHS
+    frozen = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers = squeezenet_layers()
+        layers.load_state_dict(packaged_weights()[0])
+        # In a tuple: no submodule, so that its weights are neither learnt nor written to checkpoints.
+        self._layers = (layers.requires_grad_(False),)
+        for level, width in enumerate(self.widths):
+            self.register_buffer(f"center{level}", torch.zeros(width))
+            self.register_buffer(f"scale{level}", torch.ones(()))
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SqueezeNetEncoder:
+        """Moves the weights to where the module is moved."""
+        self._layers[0]._apply(fn, recurse)
+        return super()._apply(fn, recurse)
+
+    @torch.no_grad()
+    def raw(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Features as the network gives them, rounded to half precision: equal whether they were kept or not."""
+        x, levels = (images - self.mean) / self.std, []
+        for position, layer in enumerate(self._layers[0]):
+            x = layer(x)
+            if position in SQUEEZENET_LEVELS:
+                levels.append(x.half())
+        return levels
+
+    def standardize(self, raw: list[Tensor]) -> list[Tensor]:
+        """`raw` features with mean 0 a channel and spread 1 a level over the collection."""
+        return [
+            (x.float() - self.get_buffer(f"center{level}")[:, None, None]) * self.get_buffer(f"scale{level}")
+            for level, x in enumerate(raw)
+        ]
+
+    def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
+        """Standardised features; they take no gradient."""
+        return self.standardize(self.raw(images))
+
+    @torch.no_grad()
+    def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
+        """Takes the mean of every channel and the spread of every level from photos of the collection.
+
+        One spread for all channels of a level: a channel that hardly varies says little, and amplified it would let
+        the embedding learn single photos by heart.
+        """
+        for level, x in enumerate(self.raw(images)):
+            variance, mean = torch.var_mean(x.float(), dim=(0, 2, 3), correction=0)
+            self.get_buffer(f"center{level}").copy_(mean)
+            self.get_buffer(f"scale{level}").copy_(variance.mean().clamp_min(LEAST_VARIANCE).rsqrt())
+
+
+class ResNetEncoder(Encoder):
+    """ResNet-18 without its classifier; gives the feature maps of the stem and the four stages. It learns."""
+
+    widths = RESNET_WIDTHS
 
     def __init__(self, resnet: ResNetModel, pretrained: bool) -> None:
         super().__init__()
@@ -80,15 +172,9 @@ class Encoder(nn.Module):
         self.stages = resnet.encoder.stages
         self.pretrained = pretrained
         _freeze_norms(self)
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
-        """Feature maps from 1/4 (stem, first stage) to 1/32 of the resolution; widths `FEATURE_WIDTHS`.
-
-        Args:
-            images: RGB in [0, 1].
-        """
+        """Feature maps from 1/4 (stem, first stage) to 1/32 of the resolution."""
         features = [self.embedder((images - self.mean) / self.std)]
         for stage in self.stages:
             features.append(stage(features[-1]))
@@ -96,10 +182,7 @@ class Encoder(nn.Module):
 
     @torch.no_grad()
     def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
-        """Sets the normalisation statistics of a fresh encoder from photos, once.
-
-        Pretrained encoders keep the statistics that they came with.
-        """
+        """Sets the normalisation statistics of a fresh encoder; a pretrained one keeps those that it came with."""
         if self.pretrained:
             return
         norms = [m for m in self.modules() if isinstance(m, FrozenBatchNorm)]
@@ -110,23 +193,36 @@ class Encoder(nn.Module):
             norm.calibrating = False
 
 
-def load_encoder(source: str | None = RESNET18) -> Encoder:
-    """ResNet-18 from a folder, the Hugging Face cache, or the hub, in this order.
-
-    Where none of them has the weights, one `WildGSWarning` says what is lost, and the encoder starts fresh.
+def encoder_of(state: Mapping[str, Tensor], prefix: str) -> Encoder:
+    """An encoder of the kind that a checkpoint holds, whose tensors are still to be loaded.
 
     Args:
-        source: A folder in the hub's layout, a hub name, or None for a fresh encoder without a warning.
+        state: The checkpoint's tensors.
+        prefix: Of the names of the encoder's tensors.
+    """
+    return SqueezeNetEncoder() if f"{prefix}center0" in state else load_encoder(None)
+
+
+def load_encoder(source: str | None = SQUEEZENET) -> Encoder:
+    """The frozen SqueezeNet, or a ResNet-18 from a folder, the Hugging Face cache or the hub, in this order.
+
+    Where a ResNet-18's weights cannot be found, one `WildGSWarning` says so, and it starts from random weights.
+
+    Args:
+        source: `SQUEEZENET`; else a ResNet-18: a folder in the hub's layout, a hub name, or None for random weights
+            without a warning.
 
     Raises:
         UserError: `source` is an existing folder that does not hold a ResNet-18.
     """
+    if source == SQUEEZENET:
+        return SqueezeNetEncoder()
     from transformers import ResNetConfig, ResNetModel
 
     if source is not None:
         resnet = _pretrained_resnet(source)
         if resnet is not None:
-            return Encoder(resnet, pretrained=True)
+            return ResNetEncoder(resnet, pretrained=True)
         warnings.warn(
             f"no ImageNet weights for the encoder ({source} is neither cached nor reachable): masks and global "
             f"embeddings are learnt from scratch and will be weaker; get them with `hf download {source}`",
@@ -134,9 +230,9 @@ def load_encoder(source: str | None = RESNET18) -> Encoder:
             stacklevel=2,
         )
     config = ResNetConfig(
-        embedding_size=64, hidden_sizes=list(FEATURE_WIDTHS[1:]), depths=[2, 2, 2, 2], layer_type="basic"
+        embedding_size=64, hidden_sizes=list(RESNET_WIDTHS[1:]), depths=[2, 2, 2, 2], layer_type="basic"
     )
-    return Encoder(ResNetModel(config), pretrained=False)
+    return ResNetEncoder(ResNetModel(config), pretrained=False)
 
 
 def _pretrained_resnet(source: str) -> ResNetModel | None:
@@ -147,7 +243,7 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
             resnet = ResNetModel.from_pretrained(source, local_files_only=True, use_safetensors=True)
         except (OSError, ValueError, RuntimeError) as error:
             raise UserError(f"{source} does not hold a ResNet-18 in the hub's layout: {error}") from error
-        if tuple(resnet.config.hidden_sizes or ()) != FEATURE_WIDTHS[1:]:
+        if tuple(resnet.config.hidden_sizes or ()) != RESNET_WIDTHS[1:]:
             raise UserError(f"{source} holds another network than ResNet-18; give the folder of {RESNET18}")
         return resnet
     for local in (True, False):

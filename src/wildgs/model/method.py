@@ -111,8 +111,18 @@ class Method(nn.Module, ABC):
         camera: Camera,
         stage: Stage,
         keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        name: str | None = None,
     ) -> TrainingOutput:
-        """Renders a training photo under its own appearance, with gradients."""
+        """Renders a training photo under its own appearance, with gradients.
+
+        Args:
+            photo: RGB in [0, 1].
+            camera: Its camera, of the photo's size.
+            stage: Where training stands.
+            keep: The user's own mask: pixels that are False are not lifted.
+            name: The photo's, by which what never changes of it may be kept.
+        """
 
     def render(
         self,

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.model.config import ParsingConfig
-from wildgs.model.encoder import FEATURE_WIDTHS, Encoder, load_encoder
+from wildgs.model.encoder import Encoder, SqueezeNetEncoder, load_encoder
+from wildgs.model.feature_cache import FeatureCache, pack, unpack
 from wildgs.model.precision import MixedModule
 from wildgs.model.unet import LEAST_SPREAD, UpBlock, standardize_output
 
@@ -47,9 +48,14 @@ class _Bounded(torch.autograd.Function):
 
 
 class Parsing(MixedModule):
-    """UNet with a ResNet-18 encoder: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder)."""
+    """UNet on an encoder's features: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder).
+
+    Attributes:
+        feature_cache: Where features of a frozen encoder are kept in training; None computes them every time.
+    """
 
     opponents: Tensor
+    feature_cache: FeatureCache | None = None
 
     def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
         """Sets up a `Parsing`.
@@ -62,21 +68,26 @@ class Parsing(MixedModule):
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
         self.register_buffer("opponents", torch.tensor(OPPONENTS), persistent=False)
-        deep = FEATURE_WIDTHS[-1]
+        deep = self.encoder.widths[-1]
         summary = deep + (STATISTICS if config.color_statistics else 0)
         self.global_mlp = nn.Sequential(
             nn.Linear(summary, 64), nn.LeakyReLU(0.1), nn.Linear(64, config.global_size)
         )
         widths = (deep, *config.decoder_widths)
         self.decoder = nn.ModuleList(
-            UpBlock(widths[level], FEATURE_WIDTHS[3 - level], widths[level + 1]) for level in range(3)
+            UpBlock(widths[level], self.encoder.widths[-2 - level], widths[level + 1]) for level in range(3)
         )
         self.mask_head = nn.Conv2d(widths[-1], 1, 1)
         nn.init.zeros_(self.mask_head.weight)
         self.mask_head.bias.data.fill_(STATIC_BIAS)  # pyright: ignore[reportOptionalMemberAccess]
 
     def forward(
-        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True, learn_mask: bool = True
+        self,
+        photo: Float[Tensor, "H W 3"],
+        *,
+        learn_encoder: bool = True,
+        learn_mask: bool = True,
+        name: str | None = None,
     ) -> tuple[Float[Tensor, "H W"], Float[Tensor, " G"]]:
         """Parses one photo.
 
@@ -84,16 +95,22 @@ class Parsing(MixedModule):
             photo: RGB in [0, 1].
             learn_encoder: Whether gradients reach the encoder.
             learn_mask: Whether gradients go through the mask.
+            name: By which features of a frozen encoder are kept; None keeps nothing.
 
         Returns:
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
         networks = (self.encoder, self.decoder, self.mask_head, self.global_mlp)
-        image = self.shrink(photo)
+        # The few steps after an opacity reset, in which the mask does not learn, are not worth graphs of their own.
+        if self.encoder.frozen:
+            packed, shapes = self._frozen_features(photo, name)
+            function, image, settings = self._after_frozen, packed, (shapes, learn_mask)
+        else:
+            function, image, settings = self._networks, self.shrink(photo), (learn_encoder, learn_mask)
         if learn_mask:
-            coarse, embedding = self.replays(self._networks, networks, image, (learn_encoder, True))
-        else:  # the few steps after an opacity reset are not worth graphs of their own
-            coarse, embedding = self._networks(image, learn_encoder, False)
+            coarse, embedding = self.replays(function, networks, image, settings)
+        else:
+            coarse, embedding = function(image, *settings)
         logits = functional.interpolate(coarse, size=photo.shape[:2], mode="bilinear", align_corners=False)
         return _Bounded.apply(logits[0, 0]).sigmoid(), embedding
 
@@ -101,32 +118,65 @@ class Parsing(MixedModule):
         self, image: Float[Tensor, "1 3 h w"], learn_encoder: bool, learn_mask: bool
     ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
         """The mask's logits at a quarter of the resolution, and Emb^g."""
-        learning = torch.is_grad_enabled()
-        with self.mixed(image.device):
-            with torch.set_grad_enabled(learning and learn_encoder):
-                features = self.encoder(image)
-            x = features[-1]
-            with torch.set_grad_enabled(learning and learn_mask):
-                for block, skip in zip(self.decoder, features[3:0:-1], strict=True):
-                    x = block(x, skip)
-                coarse = self.mask_head(x)
-        embedding = self.global_mlp(self._summary(image, features[-1]))[0]
-        return coarse.float(), embedding
+        with self.mixed(image.device), torch.set_grad_enabled(torch.is_grad_enabled() and learn_encoder):
+            features = self.encoder(image)
+        return self._decode(features, self._summary(image, features[-1]), learn_mask)
+
+    def _frozen_features(
+        self, photo: Float[Tensor, "H W 3"], name: str | None
+    ) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
+        """A frozen encoder's features and the colour statistics of a photo, as one tensor, and their shapes."""
+        assert isinstance(self.encoder, SqueezeNetEncoder)
+        key = None if name is None else (name, *photo.shape[:2])
+        found = None if key is None or self.feature_cache is None else self.feature_cache.get(key)
+        if found is None:
+            image = self.shrink(photo)
+            found = pack([*self.encoder.raw(image), self._statistics(image).half()])
+            if key is not None and self.feature_cache is not None:
+                self.feature_cache.put(key, found)
+        return found
+
+    def _after_frozen(
+        self, packed: Tensor, shapes: tuple[tuple[int, ...], ...], learn_mask: bool
+    ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
+        """As `_networks`, from `_frozen_features`."""
+        assert isinstance(self.encoder, SqueezeNetEncoder)
+        *raw, statistics = unpack(packed, shapes)
+        features = self.encoder.standardize(raw)
+        summary = features[-1].mean(dim=(2, 3))
+        if self.config.color_statistics:
+            summary = torch.cat([summary, statistics.float()], dim=1)
+        return self._decode(features, summary, learn_mask)
+
+    def _decode(
+        self, features: Sequence[Tensor], summary: Float[Tensor, "1 S"], learn_mask: bool
+    ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
+        """The mask's logits at a quarter of the resolution, and Emb^g."""
+        x = features[-1]
+        with self.mixed(x.device), torch.set_grad_enabled(torch.is_grad_enabled() and learn_mask):
+            for block, skip in zip(self.decoder, features[-2:-5:-1], strict=True):
+                x = block(x, skip)
+            coarse = self.mask_head(x)
+        return coarse.float(), self.global_mlp(summary)[0]
 
     def _summary(self, images: Float[Tensor, "B 3 H W"], deepest: Tensor) -> Float[Tensor, "B S"]:
         """What M^G reads: the average of the deepest features and, where configured, the colour statistics."""
         pooled = deepest.float().mean(dim=(2, 3))
-        if not self.config.color_statistics:
-            return pooled
+        return (
+            torch.cat([pooled, self._statistics(images)], dim=1) if self.config.color_statistics else pooled
+        )
+
+    def _statistics(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B T"]:
+        """Mean and spread of the photos' colours."""
         opponents = torch.einsum("oc, bchw -> bohw", self.opponents, images)
         spread, mean = torch.std_mean(opponents, dim=(2, 3), correction=0)
-        return torch.cat([pooled, mean, spread], dim=1)
+        return torch.cat([mean, spread], dim=1)
 
     @torch.no_grad()
     def calibrate(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
         """Starts from what tells the photos apart.
 
-        A fresh encoder gets its normalisation statistics (a pretrained one keeps its own). The first layer of
+        The encoder gets its normalisation statistics (a pretrained ResNet keeps its own). The first layer of
         M^G is set so that pooled features enter it around 0 and with a spread of 1 over the photos, and the last
         so that Emb^g leaves it likewise: pooled features of different photos are nearly the same vector, and
         without this many steps go by until the embedding says anything about the light.
@@ -144,7 +194,7 @@ class Parsing(MixedModule):
             assert isinstance(first, nn.Linear)
             assert isinstance(last, nn.Linear)
             summary = self._summary(squares, self.encoder(squares)[-1])
-            deep = FEATURE_WIDTHS[-1]
+            deep = self.encoder.widths[-1]
             _standardize_input(first, summary, slice(0, deep))
             for each in range(deep, summary.shape[1]):
                 # These few are to tell as much as the many features: all enter with one variance.
@@ -169,6 +219,13 @@ class Parsing(MixedModule):
         if (height, width) == tuple(photo.shape[:2]):
             return image
         return functional.interpolate(image, size=(height, width), mode="bilinear", antialias=True)
+
+
+def keep_features(module: nn.Module, cache: FeatureCache | None) -> None:
+    """Sets where 2D Parsing inside a module keeps what a frozen encoder gave; None keeps nothing."""
+    for part in module.modules():
+        if isinstance(part, Parsing):
+            part.feature_cache = cache
 
 
 def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"], part: slice) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.model.config import MethodName
-from wildgs.model.encoder import load_encoder
+from wildgs.model.encoder import encoder_of
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
 from wildgs.model.triplane import Box
@@ -55,7 +55,8 @@ def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tens
             method: Method = VanillaGS(gaussians)
         else:
             box = Box(torch.zeros(3), torch.ones(3))
-            method = WildGS(config, gaussians, box, load_encoder(None))
+            encoder = encoder_of(state, "parsing.encoder.")
+            method = WildGS(config, gaussians, box, encoder)
         method.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
         first = str(error).splitlines()[0]

@@ -53,6 +53,8 @@ class VanillaGS(Method):
         camera: Camera,
         stage: Stage,
         keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        name: str | None = None,
     ) -> TrainingOutput:
         """Renders the camera's view; the photo plays no part."""
         projection = self.gaussians.project(camera)

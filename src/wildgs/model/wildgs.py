@@ -145,10 +145,17 @@ class WildGS(Method):
         return self.parse(photo).visibility
 
     def parse(
-        self, photo: Float[Tensor, "H W 3"], *, learn_encoder: bool = True, learn_mask: bool = True
+        self,
+        photo: Float[Tensor, "H W 3"],
+        *,
+        learn_encoder: bool = True,
+        learn_mask: bool = True,
+        name: str | None = None,
     ) -> Appearance:
         """2D Parsing: mask and global embedding; local appearance is left to v."""
-        visibility, embedding = self.parsing(photo, learn_encoder=learn_encoder, learn_mask=learn_mask)
+        visibility, embedding = self.parsing(
+            photo, learn_encoder=learn_encoder, learn_mask=learn_mask, name=name
+        )
         if self._lacks("global"):
             embedding = torch.zeros_like(embedding)
         return Appearance(embedding, None, None if self._lacks("mask") else visibility)
@@ -214,9 +221,13 @@ class WildGS(Method):
         camera: Camera,
         stage: Stage,
         keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        name: str | None = None,
     ) -> TrainingOutput:
         """The photo is its own reference; one projection serves the depth pass and the colours."""
-        appearance = self.parse(photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask)
+        appearance = self.parse(
+            photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask, name=name
+        )
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):

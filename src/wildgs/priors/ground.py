@@ -21,6 +21,8 @@ _LEAST_SHARE = 0.2
 _LEAST_ABOVE = 0.9
 """Of the cameras, that stand above it."""
 _LEAST_POINTS = 50
+_MAX_CELLS = 2_000_000
+"""Places of the grid, at most: of a grid that would have more, only those around the cameras are looked at."""
 _MAX_POINTS = 20_000  # in the search; more make no better plane and a table of 512 times as many numbers
 
 
@@ -51,15 +53,33 @@ def ground_points(
         return nothing
     members = _members(points, plane[None], config.tolerance)[0]
     feet, known = centers[:, :2], points[members]
-    low, high = feet.min(dim=0).values - config.reach, feet.max(dim=0).values + config.reach
-    x, y = (torch.arange(float(low[i]), float(high[i]), config.spacing) for i in range(2))
-    places = torch.cartesian_prod(x, y)
+    places = _places_around(feet, config)
     distance = torch.from_numpy(KDTree(feet.numpy()).query(places.numpy())[0])
     gap, nearest = (torch.from_numpy(found) for found in KDTree(known[:, :2].numpy()).query(places.numpy()))
     chosen = ((distance < config.reach) & (gap > config.spacing)).nonzero()[:, 0]
     chosen = chosen[distance[chosen].argsort(stable=True)[: config.points]]
     places = places[chosen]
     return torch.cat([places, (_padded(places) @ plane)[:, None]], dim=1), colors[members][nearest[chosen]]
+
+
+def _places_around(feet: Float[Tensor, "V 2"], config: GroundConfig) -> Float[Tensor, "G 2"]:
+    """A grid of places, row by row, within reach of the cameras.
+
+    Of cameras that stand so far apart that the whole grid is too large, only the cells around each are taken: a
+    stray camera costs no more than any other.
+    """
+    low, high = feet.min(dim=0).values - config.reach, feet.max(dim=0).values + config.reach
+    counts = [max(0, math.ceil((float(high[i]) - float(low[i])) / config.spacing)) for i in range(2)]
+    if counts[0] * counts[1] <= _MAX_CELLS:
+        x, y = (torch.arange(float(low[i]), float(high[i]), config.spacing) for i in range(2))
+        return torch.cartesian_prod(x, y)
+    reach = min(math.ceil(config.reach / config.spacing), math.isqrt(_MAX_CELLS // 4) // 2)
+    around = torch.cartesian_prod(*[torch.arange(-reach, reach + 1)] * 2)
+    most = max(1, _MAX_CELLS // len(around))
+    own = ((feet - low).double() / config.spacing).floor().long().unique(dim=0)
+    own = own[:: -(-len(own) // most)]
+    cells = (own[:, None] + around).reshape(-1, 2).unique(dim=0)
+    return (low + cells * config.spacing).to(feet.dtype)
 
 
 def find_ground(

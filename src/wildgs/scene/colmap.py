@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -190,7 +191,8 @@ def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
 def _checked_name(name: str, folder: Path) -> str:
     """A photo's name that stays within the image folder: other files are found, and written, by it."""
     path = PurePosixPath(name.replace("\\", "/"))
-    outside = path.is_absolute() or ".." in path.parts or (path.parts and ":" in path.parts[0])
+    outside = path.is_absolute() or ".." in path.parts or PureWindowsPath(name).drive
+    outside = outside or (os.name == "nt" and ":" in name)
     if outside or not path.name or any(character < " " for character in name):
         raise UserError(
             f"{folder}: the photo {name!r} lies outside the image folder; give it a name within it"

@@ -6,6 +6,8 @@ Colours stay in the photo's own encoding (sRGB as a rule), as every photo collec
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +34,9 @@ ASPECT_TOLERANCE = 0.01
 
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000", "AVIF", "HEIF")
 """What is decoded, whatever a file's name says. Others that Pillow knows start programs (EPS runs Ghostscript)."""
+
+DECODING_PIXELS = 100_000_000
+"""Pixels that all threads together decode at the same time; a larger picture waits until it is alone."""
 
 _open_lock = threading.Lock()
 
@@ -63,6 +68,45 @@ class Photo:
     def num_bytes(self) -> int:
         """Memory of its arrays."""
         return sum(array.nbytes for array in (self.pixels, self.mask, self.disparity) if array is not None)
+
+
+class _DecodingBudget:
+    """Shares `DECODING_PIXELS` among threads; a thread that has a share may decode further pictures under it."""
+
+    def __init__(self) -> None:
+        self._taken = 0
+        self._returned = threading.Condition()
+        self._own = threading.local()
+
+    @contextmanager
+    def share(self, pixels: int) -> Iterator[None]:
+        if getattr(self._own, "held", False):
+            yield
+            return
+        pixels = min(pixels, DECODING_PIXELS)
+        with self._returned:
+            self._returned.wait_for(lambda: self._taken + pixels <= DECODING_PIXELS)
+            self._taken += pixels
+        self._own.held = True
+        try:
+            yield
+        finally:
+            self._own.held = False
+            with self._returned:
+                self._taken -= pixels
+                self._returned.notify_all()
+
+
+_budget = _DecodingBudget()
+
+
+def decoding(image: Image.Image) -> AbstractContextManager[None]:
+    """Waits until the picture may be decoded; memory for its pixels is bounded over all threads in the block.
+
+    Every function of this module that decodes does so by itself. A caller that keeps several copies of the pixels
+    holds its share for as long.
+    """
+    return _budget.share(image.width * image.height)
 
 
 def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
@@ -166,7 +210,7 @@ def read_photo(
     Raises:
         UnreadableImageError: The file cannot be decoded, or has another shape than its camera.
     """
-    with open_image(path, max_pixels) as image:
+    with open_image(path, max_pixels) as image, decoding(image):
         turn = _orientation(image) != 1
         if camera_size is not None:
             if same_shape(image.size, camera_size):
@@ -193,7 +237,7 @@ def read_mask(
     Raises:
         UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
     """
-    with open_image(path, max_pixels) as image:
+    with open_image(path, max_pixels) as image, decoding(image):
         _check_shape(image, size)
         _load(image)
         least = 128 if image.format in ("JPEG", "MPO") else 1
@@ -210,7 +254,7 @@ def read_disparity(
     Raises:
         UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
     """
-    with open_image(path, max_pixels) as image:
+    with open_image(path, max_pixels) as image, decoding(image):
         _check_shape(image, size)
         _load(image)
         values = np.asarray(_to_grey(image)).astype(np.float32)
@@ -258,7 +302,7 @@ def _to_rgb(image: Image.Image) -> tuple[Image.Image, UInt8[np.ndarray, "H W"] |
         return Image.fromarray(_to_8_bits(np.asarray(image))).convert("RGB"), None
     has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     if not has_alpha:
-        return image.convert("RGB"), None
+        return image if image.mode == "RGB" else image.convert("RGB"), None
     rgba = image.convert("RGBA")
     black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
     return Image.alpha_composite(black, rgba).convert("RGB"), np.array(rgba.getchannel("A"))

@@ -17,6 +17,8 @@ from wildgs.geometry.camera import Camera
 from wildgs.scene.photo_store import PhotoStore
 
 Split = Literal["train", "test"]
+LEAST_PHOTOS = 3
+"""Photos that triangulate a point by which something static is proven."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +199,26 @@ def observations_of(
     row_of = torch.tensor([rows.get(name, -1) for name in names], dtype=torch.int32)
     moved = torch.stack([row_of[observations[:, 0].long()], observations[:, 1]], dim=1)
     return moved[moved[:, 0] >= 0]
+
+
+def observed_pixels(scene: Scene, least_photos: int = LEAST_PHOTOS) -> dict[str, Float[Tensor, "K 2"]]:
+    """Where each training photo shows points that photos agree on, in pixels (x, y) by the photo's name.
+
+    Args:
+        scene: With observations.
+        least_photos: Points that fewer photos triangulated are left out.
+    """
+    pairs = scene.observations.long().unique(dim=0)
+    photos = pairs[:, 1].bincount(minlength=len(scene.points))
+    pairs = pairs[photos[pairs[:, 1]] >= least_photos]
+    parts = pairs[:, 1].split(pairs[:, 0].bincount(minlength=len(scene.views)).tolist())
+    pixels = {}
+    for view, rows in zip(scene.views, parts, strict=True):
+        if view.split == "train" and len(rows):
+            found, depth = view.camera.project(scene.points[rows])
+            size = torch.tensor([view.camera.width, view.camera.height])
+            pixels[view.name] = found[(depth > 0) & ((found >= 0) & (found < size)).all(dim=1)]
+    return pixels
 
 
 def scene_extent(scene: Scene) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import check_regular
 from wildgs.scene.colmap import describe_names
 from wildgs.scene.scene import Split
 
@@ -42,8 +43,9 @@ def read_split(path: Path) -> dict[str, Split]:
         UserError: The file is not such a table.
     """
     try:
+        check_regular(path)
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise UserError(f"{path}: larger than {MAX_FILE_BYTES} bytes; this is no split file")
+            raise UserError(f"{path}: larger than {MAX_FILE_BYTES} bytes; this is not a split file")
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(csv.DictReader(file, delimiter="\t"))
     except (OSError, UnicodeDecodeError, csv.Error) as error:

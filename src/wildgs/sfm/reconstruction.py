@@ -5,15 +5,17 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
+import warnings
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pycolmap
 from PIL import Image
 
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.processes import signals_as_interrupts
 from wildgs.scene.colmap import LAYOUTS
 from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
@@ -29,8 +31,12 @@ from wildgs.sfm.mapping import (
     quiet,
 )
 from wildgs.sfm.pairs import PairingConfig
-from wildgs.sfm.report import REPORT_NAME, SfmReport
+from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
+
+SCENE_PARTS = ("images", "sparse", "masks", REPORT_NAME)
+ASIDE, DONE = ".replaced", ".done"
+"""Folder of the old scene while the new one takes its place, and the file in it that says that it has."""
 
 __all__ = ["PairingConfig", "Progress", "SfmConfig", "SfmReport", "reconstruct"]
 
@@ -46,15 +52,18 @@ def reconstruct(
     """Find the cameras of a folder of photos and write a scene that `load_scene` reads.
 
     Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental, and
-    the largest model is kept and undistorted. CUDA is used where pycolmap was built with it.
+    the largest model is kept and undistorted. CUDA is used where pycolmap was built with it. SIGTERM and SIGHUP
+    end the work as Ctrl-C does; nothing temporary is left.
 
     Args:
         photos: Folder of photos, sub-folders included. It is only read.
         output: Scene folder to write: `images/`, `sparse/0/`, `masks/` where photos have transparent pixels,
             and `sfm_report.json`. It appears only when all is done.
         config: Limits; the defaults where None.
-        overwrite: Replace the scene that an earlier run left in `output`.
-        progress: Told about every step.
+        overwrite: Replace the scene that an earlier run left in `output`. The old scene stays until the new one is
+            complete. Its depth, and masks that were added to it, do not fit the new photos and are renamed to
+            `depth_replaced/` and `masks_replaced/`.
+        progress: Called with every step.
 
     Returns:
         Which photos were registered, and why the others were not.
@@ -65,9 +74,14 @@ def reconstruct(
     config, progress = config or SfmConfig(), progress or (lambda stage, done, total: None)
     photos, output = Path(photos), Path(output)
     started = time.perf_counter()
+    _restore(output)
     _check_output(photos, output, overwrite)
     output.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.sfm.") as folder, quiet():
+    with (
+        signals_as_interrupts(),
+        tempfile.TemporaryDirectory(dir=output.parent, prefix=".wildgs-sfm-") as folder,
+        quiet(),
+    ):
         work = Workplace(Path(folder))
         copies, broken = copy_upright(
             photos,
@@ -99,6 +113,8 @@ def reconstruct(
             pairs=len(pairing.pairs),
             models=tuple(model.num_reg_images() for model in models),
             seconds=time.perf_counter() - started,
+            renamed={c.name: c.scene_name for c in copies if _is_renamed(c)},
+            masks=_files_in(work.scene / "masks"),
         )
         report.write(work.scene)
         _move_in(work.scene, output)
@@ -106,7 +122,7 @@ def reconstruct(
 
 
 def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
-    """Never write over photos or models that another program, or the user, put there."""
+    """Never overwrite photos or models that another program, or the user, put there."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; give a folder for the scene")
     folders = ("images", "masks", *(sparse for sparse, _ in LAYOUTS))
@@ -114,25 +130,87 @@ def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
     if not taken:
         return
     if photos.resolve().is_relative_to(output.resolve()):
-        raise UserError(f"{output}: the photos lie in this folder, which would be written over; give another")
+        raise UserError(f"{output}: the photos lie in this folder, which would be overwritten; give another")
     if not (output / REPORT_NAME).is_file():
         raise UserError(f"{output}: holds {taken[0]}/ that `wildgs sfm` did not make; give another folder")
     if not overwrite:
         raise UserError(f"{output}: already holds a scene; give another folder, or --overwrite")
 
 
+def _is_renamed(copy: WorkingCopy) -> bool:
+    return str(PurePosixPath(copy.name).with_suffix("")) != str(
+        PurePosixPath(copy.scene_name).with_suffix("")
+    )
+
+
+def _files_in(folder: Path) -> tuple[str, ...]:
+    return tuple(sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()))
+
+
 def _move_in(scene: Path, output: Path) -> None:
-    """Put the finished scene in its place; other files in `output` stay."""
+    """Put the finished scene in its place; other files in `output` stay.
+
+    If that fails half-way, the old scene is put back; if the process is killed, by the next call's `_restore`.
+    """
     output.mkdir(exist_ok=True)
-    aside = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}.old."))
+    aside = output / ASIDE
+    aside.mkdir()
+    moved: list[Path] = []
     try:
-        for name in ("images", "sparse", "masks", REPORT_NAME):
+        for name in (*SCENE_PARTS, "depth"):
             if (output / name).exists():
                 (output / name).rename(aside / name)
-        for item in scene.iterdir():
+        # The report first: with it, what a killed process leaves is known as a scene of `wildgs sfm`.
+        for item in sorted(scene.iterdir(), key=lambda item: item.name != REPORT_NAME):
             item.rename(output / item.name)
-    finally:
-        shutil.rmtree(aside)
+            moved.append(output / item.name)
+    except BaseException:
+        for item in moved:
+            shutil.rmtree(item) if item.is_dir() else item.unlink()
+        _restore(output)
+        raise
+    kept = [_keep(aside / name, output) for name in _not_made_here(aside)]
+    (aside / DONE).touch()
+    shutil.rmtree(aside)
+    if kept:
+        warnings.warn(
+            f"{output}: {' and '.join(kept)} belonged to the replaced scene and may not fit the new one; delete"
+            " what is no longer needed",
+            WildGSWarning,
+            stacklevel=3,
+        )
+
+
+def _restore(output: Path) -> None:
+    """Put back the scene that a killed or failed replacement left aside."""
+    aside = output / ASIDE
+    if not aside.is_dir():
+        return
+    if not (aside / DONE).exists():
+        for item in aside.iterdir():
+            new = output / item.name
+            if new.is_dir():
+                shutil.rmtree(new)
+            item.replace(new)
+    shutil.rmtree(aside)
+
+
+def _not_made_here(aside: Path) -> list[str]:
+    """Parts of a replaced scene that `reconstruct` did not write: depth, and masks that somebody added."""
+    names = ["depth"] if (aside / "depth").is_dir() else []
+    if set(_files_in(aside / "masks")) - set(read_masks(aside)):
+        names.append("masks")
+    return names
+
+
+def _keep(folder: Path, output: Path) -> str:
+    """Move a folder of the replaced scene beside the new one's; its new name."""
+    number, target = 1, output / f"{folder.name}_replaced"
+    while target.exists():
+        number += 1
+        target = output / f"{folder.name}_replaced_{number}"
+    folder.rename(target)
+    return f"{target.name}/"
 
 
 def _write_scene(work: Workplace, copies: Sequence[WorkingCopy], model: Any) -> None:

@@ -1,12 +1,13 @@
-"""What structure from motion made of a folder of photos, for people and for programs."""
+"""The result of structure from motion on a folder of photos, for people and for programs."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from wildgs.files import printable
 from wildgs.sfm.pairs import PairingName
 
 REPORT_NAME = "sfm_report.json"
@@ -20,6 +21,8 @@ class SfmReport:
         photos: Number of photos found.
         registered: Names in the scene of the photos with a pose.
         left_out: From the names of the other photos to the likely reason.
+        renamed: From the names of photos to their names in the scene, where these differ in more than the ending.
+        masks: Files in the scene's `masks/` that were written with it.
         points: Number of sparse points.
         reprojection_error: Mean over the points, pixels.
         pairing: How the pairs to match were chosen.
@@ -37,6 +40,8 @@ class SfmReport:
     pairs: int
     models: tuple[int, ...]
     seconds: float
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    masks: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """The report in plain sentences."""
@@ -49,10 +54,23 @@ class SfmReport:
             text.append(
                 f"{len(self.left_out)} photos have no pose and take no part; the others are not affected:"
             )
-            text += [f"  {name}: {reason}" for name, reason in sorted(self.left_out.items())]
+            text += [f"  {printable(name)}: {reason}" for name, reason in sorted(self.left_out.items())]
+        if self.renamed:
+            text.append(f"{len(self.renamed)} photos have other names in the scene:")
+            text += [f"  {printable(name)}: {renamed}" for name, renamed in sorted(self.renamed.items())]
         return text
 
     def write(self, folder: Path) -> None:
         """Write the report as `sfm_report.json`."""
         text = json.dumps(asdict(self), indent=2, ensure_ascii=False)
-        (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8")
+        # Bytes that are not UTF-8 become JSON's own escapes, from which `read` gets them back.
+        (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def read_masks(folder: Path) -> list[str]:
+    """The masks that an earlier report lists; none if there is no report, or an older one without the list."""
+    try:
+        masks = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8")).get("masks", [])
+    except (OSError, ValueError, AttributeError):
+        return []
+    return [str(name) for name in masks] if isinstance(masks, list) else []

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError
 from wildgs.library.loaded import LoadedScene, load
+from wildgs.processes import TerminatedError, signals_as_interrupts
 from wildgs.scene import Scene
 from wildgs.viewer.config import ServerConfig, ViewerConfig
 from wildgs.viewer.jobs import start_worker
@@ -44,14 +45,21 @@ class OpenViewer:
             self._worker = start_worker(self.viewer.jobs)
 
     def stay(self) -> None:
-        """Serves until Ctrl-C, then closes the page."""
+        """Serves until Ctrl-C, then closes the page.
+
+        Raises:
+            TerminatedError: SIGTERM or SIGHUP came; the page is closed.
+        """
         self.start()
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self.close()
+        with signals_as_interrupts():
+            try:
+                threading.Event().wait()
+            except TerminatedError:
+                raise
+            except KeyboardInterrupt:
+                pass
+            finally:
+                self.close()
 
     def close(self) -> None:
         """Closes the page."""
