@@ -1,4 +1,4 @@
-"""The process: its place among those that torchrun started, signals that end it, its environment. Imports little."""
+"""The process: its place among those of torchrun, signals that end it, its environment; imports little."""
 
 from __future__ import annotations
 
