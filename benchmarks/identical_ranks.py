@@ -26,7 +26,6 @@ from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method
-from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
 from wildgs.scene import DataConfig, load_scene
 
@@ -40,7 +39,7 @@ def work(folder: Path, steps: int, team: Team) -> None:
     lines = []
     for name in METHODS:
         torch.manual_seed(0)
-        method = create_method(name, WildGSConfig(), scene.points, scene.point_colors)
+        method = create_method(name, None, scene)
         schedule = ScheduleConfig(
             first_stage=10_000,
             densify_from=1,

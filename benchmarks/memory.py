@@ -82,9 +82,7 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
     from wildgs.engine.schedule import ScheduleConfig
     from wildgs.engine.trainer import TrainConfig, Trainer
     from wildgs.geometry.camera import Camera
-    from wildgs.model.parsing import ParsingConfig
-    from wildgs.model.registry import create_method
-    from wildgs.model.wildgs import WildGSConfig
+    from wildgs.model.registry import method_type
     from wildgs.scene import Alignment, Scene, View
     from wildgs.scene.images import Photo
     from wildgs.scene.photo_store import MemoryPhotos
@@ -105,10 +103,10 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
         for index in range(2)
     )
     scene = Scene(Path("memory"), views, points, colors, Alignment.identity())
-    model = WildGSConfig(parsing=ParsingConfig(encoder="nobody/none"))
+    kind = method_type(command.method)
     schedule = ScheduleConfig(first_stage=1, densify_from=1, densify_every=30_000 // command.steps * 2)
     config = TrainConfig(steps=command.steps, schedule=schedule)
-    trainer = Trainer(create_method(command.method, model, points, colors), scene, config)
+    trainer = Trainer(kind.from_points(kind.Config(), points, colors), scene, config)
     trainer.run()
     with tempfile.TemporaryDirectory() as folder:
         save_checkpoint(Path(folder), trainer.step, trainer.state(), {})
@@ -118,7 +116,6 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
 def _train_on_photos(command: Command) -> None:
     from wildgs.engine.trainer import TrainConfig, Trainer
     from wildgs.model.registry import create_method
-    from wildgs.model.wildgs import WildGSConfig
     from wildgs.scene import DataConfig, load_scene
     from wildgs.scene.config import parse_bytes
     from wildgs.scene.images import read_photo
@@ -132,7 +129,7 @@ def _train_on_photos(command: Command) -> None:
         print(
             f"\n{len(scene.views)} photos of {width}x{height}: peak {_peak() / 2**20:.0f} MiB after reading"
         )
-        method = create_method(command.method, WildGSConfig(), scene.points, scene.point_colors)
+        method = create_method(command.method, None, scene)
         trainer = Trainer(method, scene, TrainConfig(steps=command.steps))
         trainer.run([lambda report: print(f"step {report.step}: peak {_peak() / 2**20:.0f} MiB", flush=True)])
         beyond = _peak() - parse_bytes(command.image_cache)

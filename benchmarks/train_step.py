@@ -36,7 +36,7 @@ from resized_demo import write_resized_demo
 from wildgs.engine.density import DensityConfig
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
-from wildgs.model.registry import MethodName, create_method
+from wildgs.model.registry import MethodName, method_type
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
 from wildgs.scene import DataConfig, Scene, load_scene
@@ -186,7 +186,9 @@ def make_trainer(
     source = torch.randint(len(scene.points), (n,), generator=generator)
     noise = 0.02 * torch.randn(n, 3, generator=generator)
     torch.manual_seed(0)
-    method = create_method(name, model, scene.points[source] + noise, scene.point_colors[source])
+    kind = method_type(name)
+    options = model if isinstance(model, kind.Config) else kind.Config()
+    method = kind.from_points(options, scene.points[source] + noise, scene.point_colors[source])
     config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
     trainer = Trainer(method.to(device), scene, config, team)
     trainer.cuda_graphs = graphs

@@ -106,7 +106,7 @@ def test_plain_3dgs_has_its_own_light(landmark: Path, tmp_path: Path) -> None:
     main(["train", str(landmark), "--output", str(tmp_path / "run"), "--method", "3dgs", "--steps", "5"])
     scene = wildgs.load(tmp_path / "run")
     assert not scene.relightable
-    with pytest.warns(WildGSWarning, match="one light"):
+    with pytest.warns(WildGSWarning, match="cannot be relit"):
         look = scene.appearance(scene.views[0].name)
     other = scene.appearance("neutral")
     camera = scene.views[0].camera

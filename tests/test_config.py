@@ -6,29 +6,29 @@ from pathlib import Path
 
 import pytest
 
-from wildgs.config import RunConfig, differing_entries, with_entries
+from wildgs.config import RunConfig, differing_entries, from_plain, to_plain, with_entries
 from wildgs.errors import UserError
-from wildgs.model.config import WrappingConfig
+from wildgs.model.config import VanillaConfig, VanillaRates, WildGSRates, WrappingConfig
 
 BASE = RunConfig(Path("scene"))
 
 
 def test_changes_what_it_names_and_nothing_else():
-    changed = with_entries(BASE, {"train.optimizer.networks": 2, "model.wrapping.widths": [8, 16]})
-    assert changed.train.optimizer.networks == 2.0
+    changed = with_entries(BASE, {"model.learning_rates.networks": 2, "model.wrapping.widths": [8, 16]})
+    assert changed.model.learning_rates.networks == 2.0
     assert changed.model.wrapping.widths == (8, 16)
     assert differing_entries(BASE, changed) == {
-        "train.optimizer.networks": (BASE.train.optimizer.networks, 2.0),
+        "model.learning_rates.networks": (BASE.model.learning_rates.networks, 2.0),
         "model.wrapping.widths": (list(BASE.model.wrapping.widths), [8, 16]),
     }
-    assert BASE.train.optimizer.networks != 2
+    assert BASE.model.learning_rates.networks != 2
 
 
 @pytest.mark.parametrize(
     ("entries", "said"),
     [
         ({"train.optimiser.networks": 1.0}, "unknown entry 'optimiser'"),
-        ({"train.optimizer.network": 1.0}, "known are"),
+        ({"train.optimizer.mean": 1.0}, "known are"),
         ({"train.steps": "many"}, "config.train.steps: 'many' is not a int"),
         ({"train.steps.more": 1}, "steps is a value"),
         ({"method": "nerf"}, "config.method"),
@@ -38,6 +38,38 @@ def test_changes_what_it_names_and_nothing_else():
 def test_what_does_not_exist_or_fit_is_named(entries, said):
     with pytest.raises(UserError, match=said):
         with_entries(BASE, entries)
+
+
+def test_files_of_earlier_versions_open():
+    """Rates of a method's own parameters lay in `train.optimizer`, and 3dgs carried Wild-GS's options."""
+    rates = {
+        "means": 1e-4,
+        "intrinsic": 1e-3,
+        "networks": 2e-3,
+        "encoder": 3e-4,
+        "network_decay": 0.5,
+        "sh0": 4e-3,
+    }
+    train = {"steps": 7, "optimizer": rates, "objective": {"mask_threshold": 0.5, "weight_l1": 0.7}}
+    old = {"scene": "there", "model": {"without": ["mask"], "sky": {"points": 3}}, "train": train}
+    wildgs = from_plain(RunConfig, old)
+    assert wildgs.model.learning_rates == WildGSRates(1e-3, 2e-3, 3e-4, 0.5)
+    assert (wildgs.model.without, wildgs.model.sky.points) == (("mask",), 3)
+    assert (wildgs.train.steps, wildgs.train.optimizer.means, wildgs.train.objective.weight_l1) == (
+        7,
+        1e-4,
+        0.7,
+    )
+    vanilla = from_plain(RunConfig, old | {"method": "3dgs"})
+    assert vanilla.model == VanillaConfig(VanillaRates(sh0=4e-3))
+    assert from_plain(RunConfig, to_plain(vanilla)) == vanilla
+
+
+def test_a_configuration_takes_its_own_methods_options_alone():
+    assert RunConfig(Path("scene"), "3dgs").model == VanillaConfig()
+    assert BASE.with_method("3dgs").with_method("wildgs") == BASE
+    with pytest.raises(TypeError, match="3dgs takes a VanillaConfig"):
+        RunConfig(Path("scene"), "3dgs", model=BASE.model)
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from wildgs.config import RunConfig, differing_entries
-from wildgs.presets import with_preset
+from wildgs.presets import PresetName, with_preset
 
 BASE = RunConfig(Path("scene"))
 
@@ -14,22 +16,41 @@ def test_default_changes_nothing() -> None:
     assert with_preset(BASE, "default") == BASE
 
 
-def test_paper_leaves_out_all_that_is_ours() -> None:
-    changed = differing_entries(BASE, with_preset(BASE, "paper"))
-    assert {path: new for path, (_, new) in changed.items()} == {
-        "model.parsing.encoder": "microsoft/resnet-18",
-        "model.parsing.color_statistics": False,
-        "model.wrapping.resolution": 128,
-        "model.fusion.color_transform": False,
-        "model.fusion.sh_degree": 3,
-        "model.depth_points.points": 0,
-        "model.wrapping.partial_lifts": 0.0,
-        "model.ground.points": 0,
-        "model.sky.points": 0,
-        "model.color_match": False,
-        "train.objective.depth_weight": 0.05,
-        "train.schedule.encoder_every": 1,
-    }
+MENDED = {
+    "model.parsing.encoder": "microsoft/resnet-18",
+    "model.wrapping.resolution": 128,
+    "model.parsing.color_statistics": False,
+    "model.fusion.color_transform": False,
+    "model.fusion.sh_degree": 3,
+    "model.depth_points.points": 0,
+    "model.wrapping.partial_lifts": 0.0,
+    "model.ground.points": 0,
+    "model.sky.points": 0,
+    "model.color_match": False,
+    "train.objective.depth_weight": 0.05,
+    "train.schedule.encoder_every": 1,
+    "train.density.prune_by_distance": False,
+    "train.density.prune_reach": 0.0,
+    "train.density.reset_unseen": True,
+}
+PRINTED = MENDED | {
+    "model.parsing.bounded_logits": False,
+    "model.fusion.direct_path": False,
+    "train.objective.mask_gradient": "loss",
+    "train.schedule.mask_pause": 0,
+}
+
+
+@pytest.mark.parametrize(("name", "expected"), [("paper", PRINTED), ("paper-mended", MENDED)])
+def test_paper_leaves_out_all_that_is_ours(name: PresetName, expected: dict[str, object]) -> None:
+    changed = differing_entries(BASE, with_preset(BASE, name))
+    assert {path: new for path, (_, new) in changed.items()} == expected
+
+
+def test_entries_of_another_method_are_left_out() -> None:
+    vanilla = with_preset(BASE.with_method("3dgs"), "paper")
+    assert vanilla.model == BASE.with_method("3dgs").model
+    assert vanilla.train.density.prune_reach == 0
 
 
 def test_fast_takes_half_the_steps_asked_for() -> None:

@@ -17,7 +17,7 @@ import yaml.composer
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import written_aside
-from wildgs.model.config import MethodName, WildGSConfig
+from wildgs.model.registry import DEFAULT_METHOD, MethodName, config_type
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
 MAX_CONFIG_BYTES = 1_000_000
@@ -68,17 +68,31 @@ class RunConfig:
 
     Attributes:
         scene: The scene folder when the run was made; a place only, in which two equal configurations may differ.
-        method: `wildgs`, or `3dgs` for the paper's baseline.
+        method: A name in `wildgs.model.registry.METHODS`.
         data: How the scene is read.
-        model: Wild-GS; without effect on `3dgs`.
+        model: The method's own options, an instance of its `Config`; None takes the defaults.
         train: Training.
     """
 
     scene: Path = field(default=Path(), compare=False)
-    method: MethodName = "wildgs"
+    method: MethodName = DEFAULT_METHOD
     data: DataConfig = field(default_factory=DataConfig)
-    model: WildGSConfig = field(default_factory=WildGSConfig)
+    model: Any = None
     train: TrainConfig = field(default_factory=TrainConfig)
+
+    def __post_init__(self) -> None:
+        """Fills in the method's default options, and refuses those of another method."""
+        kind = config_type(self.method)
+        if self.model is None:
+            object.__setattr__(self, "model", kind())
+        elif not isinstance(self.model, kind):
+            raise TypeError(
+                f"method {self.method} takes a {kind.__name__}, not a {type(self.model).__name__}"
+            )
+
+    def with_method(self, method: MethodName) -> RunConfig:
+        """The same run by another method, with that method's default options."""
+        return self if method == self.method else dataclasses.replace(self, method=method, model=None)
 
 
 def to_plain(value: Any) -> Any:
@@ -130,6 +144,13 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
         raise UserError(f"{where}: expected a mapping, found {_shortened(value)}")
     hints = typing.get_type_hints(kind)
+    if kind is RunConfig:
+        try:
+            config_type(_method_of(value))
+        except UserError as error:
+            raise UserError(f"{where}.{error}") from error
+        value = _upgraded(value)
+        hints["model"] = config_type(_method_of(value))
     known = {f.name for f in dataclasses.fields(kind)}
     if unknown := sorted(map(str, set(value) - known)):
         raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; known are {', '.join(sorted(known))}")
@@ -137,6 +158,53 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if lacking := sorted(required - set(value)):
         raise UserError(f"{where}: the entry {lacking[0]!r} is missing")
     return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
+
+
+def _method_of(plain: dict[str, Any]) -> str:
+    return str(plain.get("method", DEFAULT_METHOD))
+
+
+_MOVED_RATES = {
+    "intrinsic": "intrinsic",
+    "networks": "networks",
+    "encoder": "encoder",
+    "network_decay": "decay",
+    "sh0": "sh0",
+    "shN": "shN",
+}
+"""From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
+
+
+def _upgraded(plain: dict[str, Any]) -> dict[str, Any]:
+    """A run's configuration as an earlier version wrote it, in today's form.
+
+    Learning rates of a method's own parameters were entries of `train.optimizer`, every method carried the default
+    method's options, and `train.objective` repeated the mask's threshold.
+    """
+    known = _entries(config_type(_method_of(plain)))
+    model = plain.get("model")
+    if isinstance(model, dict):
+        foreign = _entries(config_type(DEFAULT_METHOD)).keys() - known.keys()
+        plain = plain | {"model": {name: value for name, value in model.items() if name not in foreign}}
+    train = plain.get("train")
+    optimizer = train.get("optimizer") if isinstance(train, dict) else None
+    if not isinstance(train, dict) or not isinstance(optimizer, dict):
+        return plain
+    moved = {name: optimizer[name] for name in _MOVED_RATES if name in optimizer}
+    if not moved:
+        return plain
+    kept = {name: value for name, value in optimizer.items() if name not in moved}
+    objective = {n: v for n, v in (train.get("objective") or {}).items() if n != "mask_threshold"}
+    plain = plain | {"train": train | {"optimizer": kept, "objective": objective}}
+    own = _entries(known["learning_rates"]) if "learning_rates" in known else {}
+    rates = {_MOVED_RATES[name]: value for name, value in moved.items() if _MOVED_RATES[name] in own}
+    return plain | {"model": (plain.get("model") or {}) | ({"learning_rates": rates} if rates else {})}
+
+
+def _entries(kind: Any) -> dict[str, Any]:
+    """Names and types of a dataclass's entries."""
+    hints = typing.get_type_hints(kind)
+    return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
 
 
 def _is_required(entry: dataclasses.Field[Any]) -> bool:
@@ -197,7 +265,7 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 
     Args:
         config: Left as it is.
-        entries: From an entry's path, as in ``train.optimizer.networks``, to its plain value.
+        entries: From an entry's path, as in ``model.learning_rates.networks``, to its plain value.
         where: Named in errors.
 
     Raises:
@@ -218,9 +286,8 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[Any, Any]]:
     """Paths of the entries in which two configurations differ, each with both plain values; without `scene`."""
     one, other = _flat(to_plain(first)), _flat(to_plain(second))
-    return {
-        path: (value, other[path]) for path, value in one.items() if value != other[path] and path != "scene"
-    }
+    paths = dict.fromkeys(path for path in (*one, *other) if path != "scene")
+    return {p: (one.get(p), other.get(p)) for p in paths if one.get(p) != other.get(p)}
 
 
 def _flat(plain: Any, path: str = "") -> dict[str, Any]:

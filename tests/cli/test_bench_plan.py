@@ -10,29 +10,36 @@ import pytest
 
 from wildgs.config import RunConfig, write_config
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.library.benchmark_plan import LABELS, find_phototourism, make_jobs, method_config, parse_variant
-from wildgs.library.config import METHODS
+from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant
+from wildgs.library.config import BENCH_METHODS
+from wildgs.model.registry import METHODS
 from wildgs.model.wildgs import Ablation
 
 BASE = RunConfig(Path())
 
 
 def test_every_ablation_is_a_method_with_a_label():
-    ablations = {method.removeprefix("without-") for method in METHODS if method.startswith("without-")}
+    ablations = {name.removeprefix("without-") for name in BENCH_METHODS if name.startswith("without-")}
     assert ablations == set(get_args(Ablation))
-    assert list(LABELS) == list(METHODS)
-    for method in METHODS:
-        config = method_config(method, BASE)
-        assert config.method == ("3dgs" if method == "3dgs" else "wildgs")
-        expected = (method.removeprefix("without-"),) if method.startswith("without-") else ()
-        assert config.model.without == expected
+    assert [label_of(name) for name in ("3dgs", "wildgs-half-steps", "without-reverse", "mine")] == [
+        "3DGS",
+        "Wild-GS†",
+        "w/o {c'}",
+        "mine",
+    ]
+    for name in BENCH_METHODS:
+        config = method_config(name, BASE)
+        assert config.method == (name if name in METHODS else "wildgs")
+        if config.method == "wildgs":
+            expected = (name.removeprefix("without-"),) if name.startswith("without-") else ()
+            assert config.model.without == expected
     assert method_config("wildgs-half-steps", BASE).train.steps == BASE.train.steps // 2
 
 
 @pytest.mark.parametrize(
     ("text", "entries"),
     [
-        ("slow:train.optimizer.networks=2e-3", {"train.optimizer.networks": 0.002}),
+        ("slow:model.learning_rates.networks=2e-3", {"model.learning_rates.networks": 0.002}),
         (
             "thin:model.wrapping.widths=[8,16],train.steps=5",
             {"model.wrapping.widths": [8, 16], "train.steps": 5},
@@ -66,7 +73,7 @@ def test_other_variants_are_refused(text, said):
 
 
 def test_jobs_differ_in_what_they_should(landmark: Path, tmp_path: Path):
-    variants = [parse_variant("slow:train.optimizer.networks=1e-4")]
+    variants = [parse_variant("slow:train.optimizer.means=1e-4")]
     jobs = make_jobs([landmark], BASE, ["3dgs", "wildgs"], variants, (0, 7), tmp_path)
     assert [(job.seed, job.method) for job in jobs] == [
         (seed, method) for seed in (0, 7) for method in ("3dgs", "wildgs", "slow")
@@ -76,7 +83,7 @@ def test_jobs_differ_in_what_they_should(landmark: Path, tmp_path: Path):
     assert slow.folder == tmp_path / "scene" / "slow" / "seed_7"
     assert slow.config.train.seed == 7
     assert slow.config.scene == landmark.resolve()
-    optimizer = replace(BASE.train.optimizer, networks=1e-4)
+    optimizer = replace(BASE.train.optimizer, means=1e-4)
     assert slow.config.train == replace(BASE.train, seed=7, optimizer=optimizer)
 
 

@@ -32,7 +32,7 @@ def trainer_on(
     config: TrainConfig = CONFIG,
 ) -> Trainer:
     torch.manual_seed(0)
-    made = create_method(method, model, scene.points, scene.point_colors)
+    made = create_method(method, model if method == "wildgs" else None, scene)
     trainer = Trainer(made.to(device), scene, config)
     trainer.begin()
     return trainer

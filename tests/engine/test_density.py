@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from wildgs.engine.density import DensityConfig, DensityControl
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
-from wildgs.model.vanilla import VanillaGS
+from wildgs.model.gaussians import Gaussians
+from wildgs.model.vanilla import VanillaConfig, VanillaGS
 
 EXTENT = 1.0
 
@@ -16,7 +19,7 @@ EXTENT = 1.0
 def method() -> VanillaGS:
     """Four Gaussians: small, large, faint, and one that does nothing."""
     torch.manual_seed(0)
-    method = VanillaGS.from_points(torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.uint8))
+    method = VanillaGS.from_points(VanillaConfig(), torch.randn(4, 3), torch.zeros(4, 3, dtype=torch.uint8))
     with torch.no_grad():
         method.gaussians.rows["log_scales"].copy_(torch.tensor([0.005, 0.05, 0.005, 0.005]).log()[:, None])
         method.gaussians.rows["opacity_logits"].copy_(torch.tensor([0.9, 0.9, 0.001, 0.9]).logit())
@@ -96,6 +99,24 @@ def test_what_fills_the_picture_goes_once_opacities_were_reset(method: VanillaGS
     assert control.reach.tolist() == [0.0, 0.0]
 
 
+def test_pruning_by_reach_can_be_switched_off(method: VanillaGS) -> None:
+    control, optimizers = controlled(method, [0.0] * 4, prune_reach=0.0)
+    control.reach = torch.tensor([0.1, 0.9, 0.0, 0.1])
+    assert round_of(control, method, optimizers, large=True).pruned == 1, "the faint one"
+
+
+def test_what_is_far_may_be_large_unless_switched_off(method: VanillaGS) -> None:
+    with torch.no_grad():
+        method.gaussians.rows["means"][0] = torch.tensor([100 * EXTENT, 0, 0])
+        method.gaussians.rows["log_scales"][0] = math.log(2 * EXTENT)
+    for by_distance, pruned in ((True, 1), (False, 2)):
+        copy = VanillaGS(
+            method.config, Gaussians({n: v.detach().clone() for n, v in method.gaussians.rows.items()})
+        )
+        control, optimizers = controlled(copy, [0.0] * 4, prune_by_distance=by_distance)
+        assert round_of(control, copy, optimizers, large=True).pruned == pruned
+
+
 def test_a_scene_is_never_pruned_to_nothing(method: VanillaGS) -> None:
     control, optimizers = controlled(method, [0.0] * 4)
     with torch.no_grad():
@@ -122,6 +143,9 @@ def test_reset_leaves_alone_what_no_photo_has_shown(method: VanillaGS) -> None:
     lowered = before.clamp(max=0.01)
     lowered[1] = before[1]
     torch.testing.assert_close(method.gaussians.opacities.detach(), lowered)
+    control = DensityControl(DensityConfig(reset_unseen=True), EXTENT, 4)
+    control.reset_opacity(method.gaussians, optimizers.rows)
+    torch.testing.assert_close(method.gaussians.opacities.detach(), before.clamp(max=0.01))
 
 
 def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:

@@ -124,7 +124,7 @@ def test_a_step_of_several_photos_misses_no_event(taken: int) -> None:
 
 
 def test_adam_of_a_mean_over_photos(wall_scene, tiny_model) -> None:
-    method = create_method("3dgs", tiny_model, wall_scene.points, wall_scene.point_colors)
+    method = create_method("3dgs", None, wall_scene)
     one, four = (Optimizers.build(method, OptimizerConfig(), 1.0, photos) for photos in (1, 4))
     for optimizers in (one, four):
         optimizers.set_progress(0.3)
@@ -136,7 +136,7 @@ def test_adam_of_a_mean_over_photos(wall_scene, tiny_model) -> None:
 
 def test_adam_goes_on_with_another_number_of_photos(wall_scene, tiny_model) -> None:
     """The bias correction of 12 photos is the same, whether they were twelve steps or three."""
-    method = create_method("3dgs", tiny_model, wall_scene.points, wall_scene.point_colors)
+    method = create_method("3dgs", None, wall_scene)
     one, four = (Optimizers.build(method, OptimizerConfig(), 1.0, photos) for photos in (1, 4))
     for _ in range(3):
         for parameter in method.parameters():
@@ -154,7 +154,7 @@ def test_fewer_photos_than_processes_is_a_users_mistake(wall_scene, tiny_model) 
     class Crowd(Team):
         size = 8
 
-    method = create_method("3dgs", tiny_model, wall_scene.points, wall_scene.point_colors)
+    method = create_method("3dgs", None, wall_scene)
     with pytest.raises(UserError, match="7 photos to train on are too few for 8 processes"):
         Trainer(method, wall_scene, TrainConfig(), Crowd())
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from wildgs.engine import memory
-from wildgs.engine.memory import FIXED_BYTES, plan_budget
+from wildgs.engine.memory import plan_budget
 from wildgs.errors import UserError
+from wildgs.model.vanilla import VanillaGS
 from wildgs.scene import Scene
 
 CPU = torch.device("cpu")
@@ -24,7 +25,7 @@ def test_what_fits_is_granted(wall_scene: Scene, monkeypatch) -> None:
 
 
 def test_a_default_budget_is_lowered_with_a_word(wall_scene: Scene, monkeypatch) -> None:
-    free = FIXED_BYTES["3dgs"] + 10**9
+    free = VanillaGS.memory.fixed + 10**9
     budget, word = plan(wall_scene, 3_000_000, free, monkeypatch)
     assert 100_000 < budget < 3_000_000
     assert word is not None
@@ -34,12 +35,12 @@ def test_a_default_budget_is_lowered_with_a_word(wall_scene: Scene, monkeypatch)
 
 def test_a_budget_that_was_asked_for_is_refused(wall_scene: Scene, monkeypatch) -> None:
     with pytest.raises(UserError, match=r"lower --max-gaussians to \d"):
-        plan(wall_scene, 3_000_000, FIXED_BYTES["3dgs"] + 10**9, monkeypatch, explicit=True)
+        plan(wall_scene, 3_000_000, VanillaGS.memory.fixed + 10**9, monkeypatch, explicit=True)
 
 
 def test_what_cannot_start_is_refused(wall_scene: Scene, monkeypatch) -> None:
     with pytest.raises(UserError, match="raise --downscale"):
-        plan(wall_scene, 3_000_000, FIXED_BYTES["3dgs"] // 2, monkeypatch)
+        plan(wall_scene, 3_000_000, VanillaGS.memory.fixed // 2, monkeypatch)
 
 
 def test_free_memory_of_the_cpu_is_known() -> None:

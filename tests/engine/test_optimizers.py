@@ -8,13 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers, edit_rows, reset_moments
-from wildgs.model.vanilla import VanillaGS
+from wildgs.model.vanilla import VanillaConfig, VanillaGS
 
 
 def trained_baseline(count: int = 12) -> tuple[VanillaGS, Optimizers]:
     """A baseline after one step whose moments tell every row apart."""
     torch.manual_seed(0)
-    method = VanillaGS.from_points(torch.randn(count, 3), torch.zeros(count, 3, dtype=torch.uint8))
+    method = VanillaGS.from_points(
+        VanillaConfig(), torch.randn(count, 3), torch.zeros(count, 3, dtype=torch.uint8)
+    )
     optimizers = Optimizers.build(method, OptimizerConfig(), extent=2.0)
     for parameter in method.gaussians.parameters():
         numbers = torch.arange(1.0, count + 1).reshape(-1, *[1] * (parameter.dim() - 1))

@@ -16,13 +16,13 @@ from wildgs.engine.safety import PATIENCE, TrainingDivergedError
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import create_method, restore_method
-from wildgs.model.wildgs import WildGSConfig
+from wildgs.model.vanilla import VanillaConfig
 from wildgs.scene import Scene
 
 
 def trainer_for(scene: Scene, steps: int) -> Trainer:
     torch.manual_seed(0)
-    method = create_method("3dgs", WildGSConfig(), scene.points, scene.point_colors)
+    method = create_method("3dgs", VanillaConfig(), scene)
     return Trainer(method, scene, TrainConfig(steps=steps, precision="float32"))
 
 
@@ -196,7 +196,7 @@ def test_a_resumed_run_with_other_photos_draws_a_new_round(wall_scene: Scene) ->
     trainer = trainer_for(wall_scene, 10)
     trainer.run([])
     checkpoint = Checkpoint(trainer.state(), {})
-    method = restore_method("3dgs", WildGSConfig(), checkpoint.method)
+    method = restore_method("3dgs", VanillaConfig(), checkpoint.method)
     fewer = Trainer(method, replace(wall_scene, views=wall_scene.views[:3]), TrainConfig(steps=20))
     with pytest.warns(WildGSWarning, match="other photos than the 3"):
         fewer.restore(checkpoint.state)

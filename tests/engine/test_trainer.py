@@ -16,6 +16,7 @@ from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import MethodName, create_method, restore_method
+from wildgs.model.vanilla import VanillaConfig
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.scene import Scene
 
@@ -26,7 +27,7 @@ def trainer_for(
     scene: Scene, model: WildGSConfig, steps: int, method: MethodName = "wildgs", **config
 ) -> Trainer:
     torch.manual_seed(0)
-    made = create_method(method, model, scene.points, scene.point_colors)
+    made = create_method(method, model if method == "wildgs" else None, scene)
     return Trainer(made, scene, TrainConfig(steps=steps, precision="float32", **config))
 
 
@@ -104,7 +105,8 @@ def test_a_resumed_run_ends_in_the_same_bits(
     assert differences(whole.state(), again.state()) == [], "two undisturbed runs"
     checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
     torch.manual_seed(123)  # whatever happened before must not matter
-    resumed = Trainer(restore_method(method, tiny_model, checkpoint.method), wall_scene, whole.config)
+    model = tiny_model if method == "wildgs" else VanillaConfig()
+    resumed = Trainer(restore_method(method, model, checkpoint.method), wall_scene, whole.config)
     resumed.restore(checkpoint.state)
     assert resumed.step == 70
     resumed.run()

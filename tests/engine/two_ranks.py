@@ -33,7 +33,7 @@ SCHEDULE = ScheduleConfig(first_stage=20 * 300, densify_from=1, densify_every=20
 def trainer_for(method: MethodName, team: Team, schedule: ScheduleConfig) -> Trainer:
     scene = build_wall_scene()
     torch.manual_seed(0)
-    made = create_method(method, build_tiny_model(), scene.points, scene.point_colors)
+    made = create_method(method, build_tiny_model() if method == "wildgs" else None, scene)
     density = DensityConfig(grow_gradient=2e-5)
     config = TrainConfig(steps=STEPS, precision="float32", schedule=schedule, density=density)
     return Trainer(made, scene, config, team)

@@ -15,7 +15,7 @@ from wildgs.evaluation.protocol import evaluate
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians, geometry_from_points
-from wildgs.model.method import Method, Stage, TrainingOutput
+from wildgs.model.method import GEOMETRY_ROWS, Method, Stage, TrainingOutput
 from wildgs.rasterize import Rendering
 from wildgs.scene.scene import Alignment, Scene, View
 
@@ -33,7 +33,19 @@ class Painter(Method):
         self.shown: list[tuple[torch.Tensor, Camera]] = []
         self.keeps: list[torch.Tensor | None] = []
 
-    def encode(self, photo, camera, keep=None, *, trust_mask=True):
+    @classmethod
+    def rows(cls, config):
+        return GEOMETRY_ROWS
+
+    @classmethod
+    def create(cls, config, initial):
+        raise AssertionError("not from points")
+
+    blank = create
+    row_rates = embed = fuse = create
+
+    def encode(self, photo, camera, keep=None, *, name=None, trust_mask=True, explicit=True):
+        assert name is None, "the protocol decides what is shown of a photo"
         assert not self.training
         assert not torch.is_grad_enabled()
         self.shown.append((photo, camera))
@@ -47,7 +59,7 @@ class Painter(Method):
     def shade(self, appearance, rows=None):
         return torch.zeros(7, 1, 3)
 
-    def training_pass(self, photo, camera, stage: Stage) -> TrainingOutput:
+    def training_pass(self, photo, camera, stage: Stage, keep=None, *, name=None) -> TrainingOutput:
         raise AssertionError("evaluation must not train")
 
     def render(self, camera, sh, *, background=None):

@@ -11,7 +11,7 @@ from tests.memory_views import make_view
 from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.parsing import ParsingConfig
-from wildgs.model.vanilla import VanillaGS
+from wildgs.model.vanilla import VanillaConfig, VanillaGS
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
 from wildgs.scene import Alignment, Scene
@@ -47,7 +47,7 @@ def _make(scene: Scene, seed: int) -> WildGS:
     config = WildGSConfig(
         parsing=ParsingConfig(max_side=32), wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8))
     )
-    model = WildGS.from_points(config, scene.points, scene.point_colors, load_encoder(None))
+    model = WildGS.from_points(config, scene.points, scene.point_colors, encoder=load_encoder(None))
     with torch.no_grad():
         model.gaussians.rows["opacity_logits"].fill_(4.0)
     return model.eval()
@@ -65,4 +65,4 @@ def other_method(wall: Scene) -> WildGS:
 
 @pytest.fixture
 def vanilla(wall: Scene) -> VanillaGS:
-    return VanillaGS.from_points(wall.points, wall.point_colors)
+    return VanillaGS.from_points(VanillaConfig(), wall.points, wall.point_colors)

@@ -49,7 +49,7 @@ def test_another_run_is_refused(other_method, look, tmp_path: Path) -> None:
 
 
 def test_plain_3dgs_has_nothing_to_save(vanilla, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="one light"):
+    with pytest.raises(UserError, match="cannot be relit"):
         save_look(own_look(vanilla), tmp_path / "a.safetensors")
 
 

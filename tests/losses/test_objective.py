@@ -4,6 +4,7 @@ import torch
 from wildgs.losses.depth import depth_correlation
 from wildgs.losses.objective import ObjectiveConfig, total_loss
 from wildgs.losses.photometric import masked_photometric
+from wildgs.losses.ssim import ssim_map
 from wildgs.losses.visibility import visibility_regularizer
 
 H, W = 24, 32
@@ -90,3 +91,28 @@ def test_pixels_that_the_user_ignores_count_in_no_term(inputs):
     plain = total_loss(ObjectiveConfig(), 0.3, inputs["photo"], inputs["render"], keep=keep)
     plain_changed = total_loss(ObjectiveConfig(), 0.3, changed["photo"], changed["render"], keep=keep)
     assert plain.total.item() == pytest.approx(plain_changed.total.item())
+
+
+def test_the_masks_gradient_as_printed_is_that_of_the_formula(inputs):
+    """λ |I⊙M - Î⊙M| + (1 - λ) (1 - SSIM(I⊙M, Î⊙M)), by plain convolutions in double precision."""
+    photo, render, visibility = (inputs[name].detach().double() for name in ("photo", "render", "visibility"))
+    render.requires_grad_()
+    visibility.requires_grad_()
+    mask = visibility[..., None]
+    similarity = ssim_map(photo * mask, render * mask).mean()
+    printed = 0.8 * (photo * mask - render * mask).abs().mean() + 0.2 * (1 - similarity)
+    expected = torch.autograd.grad(printed + 0.4 * (1 - visibility).square().mean(), [visibility, render])
+    plain = {"photo": inputs["photo"], "render": inputs["render"], "visibility": inputs["visibility"]}
+    losses = total_loss(ObjectiveConfig(mask_gradient="loss"), 0.0, **plain)
+    found = torch.autograd.grad(losses.total, [inputs["visibility"], inputs["render"]])
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other.float(), atol=1e-7, rtol=1e-3)
+
+
+def test_either_gradient_of_the_mask_belongs_to_one_value(inputs):
+    losses = {
+        kind: total_loss(ObjectiveConfig(mask_gradient=kind), 0.0, **inputs) for kind in ("loss", "evidence")
+    }
+    assert losses["loss"].as_floats() == pytest.approx(losses["evidence"].as_floats(), rel=1e-5)
+    by_mask = {k: torch.autograd.grad(v.image, [inputs["visibility"]])[0] for k, v in losses.items()}
+    assert not torch.allclose(by_mask["loss"], by_mask["evidence"], atol=1e-4)

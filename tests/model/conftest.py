@@ -43,7 +43,7 @@ def make_wall_model(wall: torch.Tensor):
             wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8), **config),  # type: ignore[arg-type]
         )
         colors = torch.full((len(wall), 3), 128, dtype=torch.uint8)
-        model = WildGS.from_points(settings, wall, colors, load_encoder(None))
+        model = WildGS.from_points(settings, wall, colors, encoder=load_encoder(None))
         with torch.no_grad():
             model.gaussians.rows["opacity_logits"].fill_(6.0)
         return model

@@ -5,8 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wildgs.model.encoder import load_encoder
+from wildgs.model.initial import sky_rows
 from wildgs.model.parsing import ParsingConfig
-from wildgs.model.sky import SkyConfig, shell_directions, sky_rows
+from wildgs.model.sky import SkyConfig, shell_directions
 from wildgs.model.wildgs import WildGS, WildGSConfig
 
 
@@ -45,10 +46,10 @@ def test_models_start_with_a_sky_unless_told_otherwise() -> None:
     points, colors = torch.rand(30, 3), torch.full((30, 3), 128, dtype=torch.uint8)
     parsing = ParsingConfig(max_side=32)
     with_sky = WildGS.from_points(
-        WildGSConfig(parsing=parsing, sky=SkyConfig(points=50)), points, colors, load_encoder(None)
+        WildGSConfig(parsing=parsing, sky=SkyConfig(points=50)), points, colors, encoder=load_encoder(None)
     )
     bare = WildGS.from_points(
-        WildGSConfig(parsing=parsing, sky=SkyConfig(points=0)), points, colors, load_encoder(None)
+        WildGSConfig(parsing=parsing, sky=SkyConfig(points=0)), points, colors, encoder=load_encoder(None)
     )
     assert (len(with_sky.gaussians), len(bare.gaussians)) == (80, 30)
     torch.testing.assert_close(with_sky.wrapping.low, bare.wrapping.low)

@@ -10,9 +10,9 @@ import torch
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings
 from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.method import Stage
-from wildgs.model.registry import create_method, restore_method
-from wildgs.model.vanilla import VanillaGS
-from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.model.registry import restore_method
+from wildgs.model.vanilla import VanillaConfig, VanillaGS
+from wildgs.model.wildgs import WildGS
 from wildgs.rasterize import blend
 
 
@@ -188,8 +188,7 @@ def test_method_returns_from_its_state(camera, make_wall_model) -> None:
 
 
 def test_baseline_ignores_the_photo(camera, wall) -> None:
-    method = create_method("3dgs", WildGSConfig(), wall, torch.full((len(wall), 3), 200, dtype=torch.uint8))
-    assert isinstance(method, VanillaGS)
+    method = VanillaGS.from_points(VanillaConfig(), wall, torch.full((len(wall), 3), 200, dtype=torch.uint8))
     first = method.training_pass(photo_of(camera, 1.0), camera, Stage())
     second = method.training_pass(photo_of(camera, 0.1), camera, Stage())
     assert first.visibility is None

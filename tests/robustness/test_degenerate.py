@@ -83,7 +83,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 def test_edges_train(name: str, method: MethodName) -> None:
     torch.manual_seed(0)
     edge = SCENES[name]()
-    made = create_method(method, MODEL, edge.points, edge.point_colors)
+    made = create_method(method, MODEL if method == "wildgs" else None, edge)
     trainer = Trainer(made, edge, TrainConfig(steps=6, precision="float32", schedule=SCHEDULE))
     trainer.run()
     assert trainer.step == 6
@@ -100,7 +100,7 @@ def test_edges_train(name: str, method: MethodName) -> None:
 
 def test_parameters_that_are_no_numbers_do_not_crash_the_rasteriser() -> None:
     edge = SCENES["one photo"]()
-    made = create_method("3dgs", MODEL, edge.points, edge.point_colors)
+    made = create_method("3dgs", None, edge)
     camera = edge.views[0].camera
     for row, value in (
         ("means", float("nan")),

@@ -361,7 +361,7 @@ def method() -> WildGS:
     torch.manual_seed(0)
     config = WildGSConfig(wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)))
     colors = torch.full((30, 3), 128, dtype=torch.uint8)
-    return WildGS.from_points(config, torch.rand(30, 3), colors, load_encoder(None)).eval()
+    return WildGS.from_points(config, torch.rand(30, 3), colors, encoder=load_encoder(None)).eval()
 
 
 @pytest.mark.parametrize("fault", [f for i, f in EXISTING if i == "appearance"])

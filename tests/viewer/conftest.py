@@ -87,7 +87,7 @@ def make_trainer(scene: Scene, steps: int, method="wildgs") -> Trainer:
     torch.manual_seed(0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", WildGSWarning)  # of weights that tests do without
-        made = create_method(method, model, scene.points, scene.point_colors)
+        made = create_method(method, model if method == "wildgs" else None, scene)
     with torch.no_grad():
         # Where Gaussians hide little, a bright wall takes colours brighter than white, which browsers have not.
         made.gaussians.rows["opacity_logits"].fill_(3.0)

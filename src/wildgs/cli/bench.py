@@ -16,7 +16,7 @@ from wildgs.cli.screen import OUT, console, progress_shown
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import ReportedError, UserError
-from wildgs.library.config import METHODS, BenchMethod, Suite
+from wildgs.library.config import BENCH_METHODS, Suite
 from wildgs.model.config import WildGSConfig
 from wildgs.scene.config import DataConfig
 
@@ -49,11 +49,11 @@ class Command:
     suite: Suite | None = None
     """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, beside the paper's
     figures."""
-    methods: tuple[BenchMethod, ...] = METHODS
-    """3dgs, wildgs, wildgs-half-steps (the paper's †), presets, and the ablations."""
+    methods: tuple[str, ...] = BENCH_METHODS
+    """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART)."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME:KEY=VALUE[,KEY=VALUE...], a further line of the table: Wild-GS with entries of config.yaml changed,
-    as in slow:train.optimizer.networks=5e-4. May be repeated."""
+    as in slow:model.learning_rates.networks=5e-4. May be repeated."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run each."""
     lpips: Path | None = None

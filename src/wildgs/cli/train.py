@@ -7,7 +7,7 @@ import contextlib
 from contextlib import ExitStack
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -16,7 +16,7 @@ from wildgs.cli.screen import console, progress_shown
 from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config, with_entries
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
-from wildgs.model.config import MethodName, WildGSConfig
+from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, config_type
 from wildgs.presets import PRESET_NAMES, PRESETS, PresetName, with_preset
 from wildgs.scene.config import DataConfig
 from wildgs.viewer.config import ServerConfig
@@ -52,8 +52,8 @@ class Command:
     """Scene folder: images/ and sparse/0/ (see docs/scene.md); with --resume, where it lies now."""
     output: Path
     """Run folder to write."""
-    method: MethodName = "wildgs"
-    """wildgs, or 3dgs for plain 3D Gaussian Splatting on the same engine."""
+    method: MethodName = DEFAULT_METHOD
+    """Method to train; `--method NAME --help-all` lists its options. 3dgs is plain 3D Gaussian Splatting."""
     preset: PresetName = "default"
     """default: best measured results; paper: nothing that the paper does not have; fast: half the steps and a
     lighter 2D Parsing. Options on the command line override the preset."""
@@ -63,7 +63,7 @@ class Command:
     max_gaussians: int | None = None
     """Upper bound on the number of Gaussians. By default --density.max-gaussians, or less where memory is short."""
     data: Annotated[DataConfig, UNNAMED] = field(default_factory=DataConfig)
-    model: Annotated[WildGSConfig, UNNAMED] = field(default_factory=WildGSConfig)
+    model: Annotated[Any, UNNAMED] = None  # `command_for` gives it the type of the method's options
     train: Annotated[TrainConfig, UNNAMED] = field(default_factory=TrainConfig)
     execution: Annotated[ExecutionConfig, UNNAMED] = field(default_factory=ExecutionConfig)
     view: bool = False
@@ -72,26 +72,35 @@ class Command:
 
 
 def command_for(arguments: list[str]) -> type[Command]:
-    """The command with the stored run's configuration, or the preset among the arguments, as its defaults."""
+    """The command with the options of the method among the arguments, or of the stored run.
+
+    Defaults are the stored run's configuration, or the preset's.
+    """
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     finder.add_argument("--preset", choices=PRESET_NAMES, default="default")
+    finder.add_argument("--method", choices=tuple(METHODS), default=DEFAULT_METHOD)
     finder.add_argument("--output", type=Path)
     finder.add_argument("--resume", action="store_true")
     try:
         found = finder.parse_known_args(arguments)[0]
     except argparse.ArgumentError:
-        return Command  # tyro reports what is wrong
-    config, fields = RunConfig(), []
+        found = finder.parse_args([])  # tyro reports what is wrong
+    config, fields = RunConfig(method=found.method), []
+    method = Literal[tuple(METHODS)]  # pyright: ignore[reportInvalidTypeForm]
     if found.resume and found.output is not None:
         with contextlib.suppress(UserError):  # reported when the run is opened
             config = read_config(found.output / CONFIG_FILE)
             fields.append(("scene", tyro.conf.Positional[Path], field(default=config.scene)))
-            fields.append(("method", MethodName, field(default=config.method)))
         # The stored number of steps has been through the preset already.
         config = with_entries(config, PRESETS[found.preset].entries, f"preset {found.preset}")
     else:
         config = with_preset(config, found.preset)
-    parts: list[tuple[str, Any]] = [("data", DataConfig), ("model", WildGSConfig), ("train", TrainConfig)]
+    parts: list[tuple[str, Any]] = [
+        ("data", DataConfig),
+        ("model", config_type(config.method)),
+        ("train", TrainConfig),
+    ]
+    fields.append(("method", method, field(default=config.method)))
     fields += [(name, Annotated[kind, UNNAMED], field(default=getattr(config, name))) for name, kind in parts]
     made = make_dataclass("Command", fields, bases=(Command,), frozen=True, kw_only=True)
     made.__doc__ = Command.__doc__

@@ -45,7 +45,7 @@ class ScheduleConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Learning rates. Those of the Gaussians are 3DGS's.
+    """Learning rates of the geometry, 3DGS's; a method has those of its own parameters (`model.learning_rates`).
 
     Attributes:
         means: Position, at the start, per unit of scene extent.
@@ -53,13 +53,6 @@ class OptimizerConfig:
         scales: Logarithms of the scales.
         quats: Orientations.
         opacities: Opacity logits.
-        sh0: Flat colour (3dgs only).
-        shN: Higher harmonics (3dgs only).
-        intrinsic: Intrinsic features (wildgs only).
-        networks: All networks but the encoder, at the start.
-        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
-            thousand steps, and the embedding of every photo becomes the same.
-        network_decay: Factor that the networks' and intrinsic rates reach at the end, exponentially.
         batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
             rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
     """
@@ -69,12 +62,6 @@ class OptimizerConfig:
     scales: float = 5e-3
     quats: float = 1e-3
     opacities: float = 5e-2
-    sh0: float = 2.5e-3
-    shN: float = 1.25e-4  # noqa: N815 - the field's name
-    intrinsic: float = 2.5e-3
-    networks: float = 1e-3
-    encoder: float = 1e-4
-    network_decay: float = 0.1
     batch_scaling: Literal["sqrt", "none"] = "sqrt"
 
 
@@ -87,20 +74,25 @@ class DensityConfig:
             device coordinates).
         split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
         prune_opacity: Fainter Gaussians go.
-        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before. Beyond
-            the extent it is a share of their distance from the middle: what is far may be as large.
+        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
+        prune_by_distance: Whether, beyond the extent, that is a share of their distance from the middle: what is
+            far may be as large. Not in 3DGS.
         prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
-            of them float right before a camera and stand for what stood in its way.
+            of them float right before a camera and stand for what stood in its way; 0 = none. Not in 3DGS.
         reset_opacity: Opacities are lowered to this at a reset.
-        max_gaussians: No growth beyond this number.
+        reset_unseen: Whether resets also lower those of Gaussians that no photo has shown yet, as 3DGS does: no
+            photo would raise them again.
+        max_gaussians: Upper bound on the number of Gaussians, from the start.
     """
 
     grow_gradient: float = 2e-4
     split_scale: float = 0.01
     prune_opacity: float = 0.005
     prune_scale: float = 0.1
+    prune_by_distance: bool = True
     prune_reach: float = 0.15
     reset_opacity: float = 0.01
+    reset_unseen: bool = False
     max_gaussians: int = 3_000_000
 
 
@@ -110,10 +102,10 @@ class TrainConfig:
 
     Attributes:
         steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
-        seed: Of everything random.
+        seed: Random seed.
         precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
         objective: Loss weights.
-        schedule: What happens when.
+        schedule: Training schedule.
         optimizer: Learning rates.
         density: Densification and pruning.
     """

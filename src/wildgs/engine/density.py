@@ -135,9 +135,7 @@ class DensityControl:
         splits = grows & ~clones
         prune = gaussians.opacities < self.config.prune_opacity
         if prune_large:
-            distance = (gaussians.means - gaussians.means.nanmedian(dim=0).values).norm(dim=-1)
-            prune = prune | (largest > self.config.prune_scale * distance.clamp_min(self.extent))
-            prune = prune | (self.reach > self.config.prune_reach)
+            prune = prune | self._select_large(gaussians, largest)
         finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)
         prune = prune | ~finite
         clones, splits = clones & ~prune, splits & ~prune
@@ -150,6 +148,17 @@ class DensityControl:
         edit_rows(gaussians, optimizer, keep, added)
         self._clear(len(gaussians))
         return DensityReport(int(clones.sum()), int(splits.sum()), int(prune.sum()))
+
+    def _select_large(self, gaussians: Gaussians, largest: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
+        """Gaussians that are too large in the scene or on some photo."""
+        allowed = torch.full_like(largest, self.extent)
+        if self.config.prune_by_distance:
+            distance = (gaussians.means - gaussians.means.nanmedian(dim=0).values).norm(dim=-1)
+            allowed = distance.clamp_min(self.extent)
+        large = largest > self.config.prune_scale * allowed
+        if self.config.prune_reach > 0:
+            large = large | (self.reach > self.config.prune_reach)
+        return large
 
     def _select_growing(self) -> Bool[Tensor, "N"]:
         mean = self.gradient_sum / self.seen.clamp_min(1)
@@ -195,14 +204,11 @@ class DensityControl:
 
     @torch.no_grad()
     def reset_opacity(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Lowers opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned.
-
-        What no photo has shown yet keeps its own: no photo would raise it again.
-        """
+        """Lowers opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned."""
         logits = gaussians.rows["opacity_logits"]
         lowered = logits.clamp(max=float(torch.tensor(self.config.reset_opacity).logit()))
         moments = optimizer.state.get(gaussians.means, {}).get("exp_avg_sq")
-        if moments is not None:
+        if moments is not None and not self.config.reset_unseen:
             lowered = torch.where((moments == 0).all(dim=1), logits, lowered)
         logits.copy_(lowered)
         reset_moments(optimizer, gaussians, "opacity_logits")

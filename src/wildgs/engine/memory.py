@@ -1,9 +1,7 @@
 """How much memory a training will take, before it takes it.
 
-`benchmarks/memory.py` measures the constants: peak resident memory of short trainings that differ in one size. For
-`3dgs` on the CPU it gave 2,095 bytes a Gaussian and 262 bytes a pixel, rounded up here; those of `wildgs` are
-reckoned from the sizes of its tensors. They hold for what a step needs beside the decoded photos, which have a
-limit of their own.
+Methods declare what they use (`wildgs.model.method.MemoryUse`); `benchmarks/memory.py` measures it as the peak
+resident memory of short trainings that differ in one size. Decoded photos have a limit of their own.
 """
 
 from __future__ import annotations
@@ -13,15 +11,11 @@ from dataclasses import dataclass
 import torch
 
 from wildgs.errors import UserError
-from wildgs.model.registry import MethodName
+from wildgs.model.method import MemoryUse
+from wildgs.model.registry import MethodName, method_type
 from wildgs.scene import Scene
 from wildgs.scene.image_cache import available_memory
 
-BYTES_PER_GAUSSIAN: dict[MethodName, int] = {"wildgs": 6000, "3dgs": 2500}
-"""Parameters, gradients, Adam's moments, the copies of densification, and one view's intermediate values."""
-BYTES_PER_PIXEL: dict[MethodName, int] = {"wildgs": 700, "3dgs": 300}
-FIXED_BYTES: dict[MethodName, int] = {"wildgs": 600 * 2**20, "3dgs": 100 * 2**20}
-"""Networks with their moments and activations, and kernels; libraries are loaded already when this is asked."""
 MARGIN = 0.9
 """Share of the free memory that may be planned with."""
 
@@ -31,29 +25,29 @@ class MemoryEstimate:
     """What training takes beside the decoded photos, bytes.
 
     Attributes:
-        method: What is trained.
-        num_gaussians: At most so many.
+        use: What the method declares.
+        num_gaussians: Upper bound on their number.
         pixels: Of the largest photo, at the size at which it trains.
     """
 
-    method: MethodName
+    use: MemoryUse
     num_gaussians: int
     pixels: int
 
     @property
     def gaussians(self) -> int:
-        """Share of the Gaussians."""
-        return self.num_gaussians * BYTES_PER_GAUSSIAN[self.method]
+        """What the Gaussians take of it."""
+        return self.num_gaussians * self.use.per_gaussian
 
     @property
     def total(self) -> int:
-        """All of it."""
-        return FIXED_BYTES[self.method] + self.pixels * BYTES_PER_PIXEL[self.method] + self.gaussians
+        """In all."""
+        return self.use.fixed + self.pixels * self.use.per_pixel + self.gaussians
 
     def largest_budget(self, available: int) -> int:
         """The most Gaussians for which `available` bytes suffice; below 0 where nothing does."""
         rest = int(MARGIN * available) - (self.total - self.gaussians)
-        return rest // BYTES_PER_GAUSSIAN[self.method]
+        return rest // self.use.per_gaussian
 
 
 def free_memory(device: torch.device) -> int | None:
@@ -64,31 +58,32 @@ def free_memory(device: torch.device) -> int | None:
 
 
 def plan_budget(
-    method: MethodName, scene: Scene, wish: int, device: torch.device, *, explicit: bool
+    method: MethodName, scene: Scene, budget: int, device: torch.device, *, explicit: bool
 ) -> tuple[int, str | None]:
     """A budget of Gaussians that fits, decided before training starts.
 
     Args:
         method: What will be trained.
         scene: Its photos are read already.
-        wish: The budget as configured.
-        device: Where.
-        explicit: Whether the user asked for this budget: then it is not lowered silently.
+        budget: Upper bound on the number of Gaussians, as configured.
+        device: Where training will run.
+        explicit: Whether the user gave this budget: then it is never lowered.
 
     Returns:
-        The budget, and what to tell where it is not the wish.
+        The budget, and a message for the user where it was lowered.
 
     Raises:
         UserError: The scene, or the budget that was asked for, cannot fit.
     """
     pixels = max(view.camera.width * view.camera.height for view in scene.views)
-    estimate = MemoryEstimate(method, wish, pixels)
+    estimate = MemoryEstimate(method_type(method).memory, budget, pixels)
     available = free_memory(device)
     if available is None or estimate.total <= MARGIN * available:
-        return wish, None
+        return budget, None
     fits = estimate.largest_budget(available)
-    needs = f"{wish:,} Gaussians on photos of {pixels / 1e6:.1f} megapixels take about {gigabytes(estimate.total)}"
-    least = min(wish, len(scene.points))
+    size = f"{pixels / 1e6:.1f} megapixels"
+    needs = f"{budget:,} Gaussians on photos of {size} take about {gigabytes(estimate.total)}"
+    least = min(budget, len(scene.points))
     if fits < least:
         raise UserError(
             f"{needs}, and {gigabytes(available)} are free, too little for the {least:,} Gaussians of the start: "

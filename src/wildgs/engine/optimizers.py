@@ -12,11 +12,19 @@ from torch import Tensor, nn
 from wildgs.engine.config import OptimizerConfig
 from wildgs.engine.schedule import exponential
 from wildgs.geometry.morton import morton_order
-from wildgs.model.encoder import Encoder
+from wildgs.model.config import LearningRate
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
 
-_ROW_RATES = {"log_scales": "scales", "opacity_logits": "opacities"}
+
+def geometry_rates(config: OptimizerConfig, extent: float) -> dict[str, LearningRate]:
+    """Learning rates of the rows that every method has; `extent` scales positions."""
+    return {
+        "means": LearningRate(config.means * extent, config.means_final / config.means),
+        "quats": LearningRate(config.quats),
+        "log_scales": LearningRate(config.scales),
+        "opacity_logits": LearningRate(config.opacities),
+    }
 
 
 @dataclass
@@ -24,13 +32,17 @@ class Optimizers:
     """Adam over the per-Gaussian rows (one group a row) and over the networks.
 
     Attributes:
+        config: Of the geometry.
+        row_rates: Learning rate of every row.
+        network_rates: Learning rate of every other group, by its name.
         rows: For `Gaussians.rows`; eps 1e-15 as 3DGS.
         networks: For everything else, or None where a method has nothing else.
         photos: Photos in the mean gradient of one step.
     """
 
     config: OptimizerConfig
-    extent: float
+    row_rates: dict[str, LearningRate]
+    network_rates: dict[str, LearningRate]
     rows: torch.optim.Adam
     networks: torch.optim.Adam | None = field(default=None)
     photos: int = 1
@@ -47,25 +59,22 @@ class Optimizers:
         """
         scaled = photos if config.batch_scaling == "sqrt" else 1
         rate, betas = scaled**0.5, (0.9**scaled, 0.999**scaled)
+        row_rates = geometry_rates(config, extent) | method.row_rates()
         groups = [
-            {"params": [parameter], "name": name, "lr": rate * _row_rate(config, name, extent)}
+            {"params": [parameter], "name": name, "lr": rate * row_rates[name].start}
             for name, parameter in method.gaussians.rows.items()
         ]
         rows = torch.optim.Adam(groups, betas=betas, eps=1e-15 / rate, fused=True)
-        owned = {id(p) for p in method.gaussians.parameters()}
-        encoder = [m for m in method.modules() if isinstance(m, Encoder)]
-        encoder_parameters = [p for m in encoder for p in m.parameters()]
-        owned |= {id(p) for p in encoder_parameters}
-        others = [p for p in method.parameters() if id(p) not in owned]
+        declared = [group for group in method.parameter_groups() if group.parameters]
         network_groups = [
-            {"params": others, "name": "networks", "lr": rate * config.networks},
-            {"params": encoder_parameters, "name": "encoder", "lr": rate * config.encoder},
+            {"params": group.parameters, "name": group.name, "lr": rate * group.rate.start}
+            for group in declared
         ]
-        network_groups = [group for group in network_groups if group["params"]]
         networks = None
         if network_groups:
             networks = torch.optim.Adam(network_groups, betas=betas, eps=1e-8 / rate, fused=True)
-        return cls(config, extent, rows, networks, photos)
+        network_rates = {group.name: group.rate for group in declared}
+        return cls(config, row_rates, network_rates, rows, networks, photos)
 
     @property
     def rate(self) -> float:
@@ -74,17 +83,10 @@ class Optimizers:
 
     def set_progress(self, progress: float) -> None:
         """Moves every learning rate to where it belongs at a share of the run in [0, 1]."""
-        config = self.config
-        decay = self.rate * exponential(1.0, config.network_decay, progress)
-        for group in self.rows.param_groups:
-            if group["name"] == "means":
-                rate = self.rate * self.extent
-                group["lr"] = rate * exponential(config.means, config.means_final, progress)
-            elif group["name"] == "intrinsic":
-                group["lr"] = config.intrinsic * decay
-        if self.networks is not None:
-            for group in self.networks.param_groups:
-                group["lr"] = getattr(config, group["name"]) * decay
+        for optimizer, rates in ((self.rows, self.row_rates), (self.networks, self.network_rates)):
+            for group in [] if optimizer is None else optimizer.param_groups:
+                chosen = rates[group["name"]]
+                group["lr"] = chosen.start * (self.rate * exponential(1.0, chosen.decay, progress))
 
     def step(self) -> None:
         """One Adam step everywhere, then clears the gradients."""
@@ -128,11 +130,6 @@ def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
     if value.shape != parameter.shape:
         return value.to(parameter.device)
     return torch.empty_like(parameter, requires_grad=False).copy_(value)
-
-
-def _row_rate(config: OptimizerConfig, name: str, extent: float) -> float:
-    rate = getattr(config, _ROW_RATES.get(name, name))
-    return rate * extent if name == "means" else rate
 
 
 @torch.no_grad()

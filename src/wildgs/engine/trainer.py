@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -114,7 +114,6 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0
         self.schedule = Schedule(config.schedule, config.steps)
-        self._objective = replace(config.objective, mask_threshold=method.mask_threshold)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
@@ -207,7 +206,7 @@ class Trainer:
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
-            self._objective,
+            self.config.objective,
             self.schedule.progress(self.step),
             photo,
             output.rendering.colors,
@@ -218,6 +217,7 @@ class Trainer:
             disparity=self.feed.disparity(view) if supervised else None,
             observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
+            mask_threshold=self.method.mask_threshold,
         )
         return output, losses
 

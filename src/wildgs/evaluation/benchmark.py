@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-BASELINE = "wildgs"
+from wildgs.model.registry import DEFAULT_METHOD
+
 MIXED = "mixed"
 PROTOCOLS = ("full", "half")
 _IN_MEAN = ("psnr", "ssim", "lpips")
@@ -92,7 +93,7 @@ def summarize(
     labels: Mapping[str, str],
     *,
     published: Published | None = None,
-    baseline: str = BASELINE,
+    baseline: str = DEFAULT_METHOD,
 ) -> list[Row]:
     """Rows by scene (as they come), protocol, and method in the order of `labels`.
 

@@ -28,14 +28,14 @@ from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
 from wildgs.files import written_aside
 from wildgs.library.benchmark_plan import (
-    LABELS,
     PHOTOTOURISM_DOWNSCALE,
     Job,
     find_phototourism,
+    label_of,
     make_jobs,
     parse_variant,
 )
-from wildgs.library.config import METHODS, BenchMethod, Suite
+from wildgs.library.config import BENCH_METHODS, Suite
 from wildgs.library.evaluation import PROTOCOLS, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.training import read_scene, train
@@ -87,7 +87,7 @@ def benchmark(
     config: RunConfig | None = None,
     *,
     output: str | Path = "wildgs-bench",
-    methods: Sequence[BenchMethod] = METHODS,
+    methods: Sequence[str] = BENCH_METHODS,
     variants: Sequence[str] = (),
     seeds: Sequence[int] = (0, 1, 2),
     suite: Suite | None = None,
@@ -147,7 +147,7 @@ def _plan(
     request: _Request,
     scenes: Sequence[Path],
     base: RunConfig,
-    methods: Sequence[BenchMethod],
+    methods: Sequence[str],
     seeds: Sequence[int],
 ) -> list[Job]:
     if not scenes or not seeds or not (methods or request.variants):
@@ -259,7 +259,7 @@ class _Bench:
             if (metrics := read_metrics(job.folder, protocol)) is not None
         ]
         labels = dict.fromkeys([job.method for job in self.jobs])
-        names = {name: LABELS.get(name, name) for name in labels}
+        names = {name: label_of(name) for name in labels}
         published = self.request.suite is not None
         rows = summarize(
             scores,

@@ -15,28 +15,14 @@ import yaml
 from wildgs.config import RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM
-from wildgs.library.config import METHODS, BenchMethod
-from wildgs.model.config import WildGSConfig
-from wildgs.presets import with_preset
+from wildgs.library.config import BENCH_METHODS, HALF, WITHOUT
+from wildgs.model.registry import METHODS, method_type
+from wildgs.presets import PRESETS, with_preset
 from wildgs.runs import CONFIG_FILE
 from wildgs.scene.colmap import find_model
 from wildgs.scene.split import find_split_file
 
-LABELS: dict[str, str] = {
-    "3dgs": "3DGS",
-    "wildgs-half-steps": "Wild-GS†",
-    "wildgs": "Wild-GS",
-    "paper": "preset paper",
-    "fast": "preset fast",
-    "without-crop": "w/o Crop",
-    "without-reverse": "w/o {c'}",
-    "without-global": "w/o Global",
-    "without-mask": "w/o Mask",
-    "without-depth": "w/o Depth",
-    "without-intrinsic": "w/o Intrinsic",
-    "without-local": "w/o Local",
-}
-"""As the paper's table has them."""
+_ABLATION_LABELS = {"reverse": "w/o {c'}"}
 
 PHOTOTOURISM_DOWNSCALE = 2
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
@@ -58,7 +44,7 @@ class Job:
 
     Attributes:
         scene: The scene's name in the table.
-        method: A `BenchMethod` or a variant's name.
+        method: One of `BENCH_METHODS`, or a variant's name.
         seed: Of the run.
         folder: Its run folder.
         config: Its configuration.
@@ -73,7 +59,7 @@ class Job:
     @property
     def title(self) -> str:
         """For the console."""
-        return f"{self.scene}, {LABELS.get(self.method, self.method)}, seed {self.seed}"
+        return f"{self.scene}, {label_of(self.method)}, seed {self.seed}"
 
 
 def parse_variant(text: str) -> Variant:
@@ -85,9 +71,9 @@ def parse_variant(text: str) -> Variant:
     name, colon, rest = text.partition(":")
     if not colon or not _NAME.fullmatch(name):
         raise UserError(
-            f"--variant {text}: expected NAME:KEY=VALUE, for example slow:train.optimizer.networks=5e-4"
+            f"--variant {text}: expected NAME:KEY=VALUE, for example slow:model.learning_rates.networks=5e-4"
         )
-    if name in METHODS:
+    if name in BENCH_METHODS:
         raise UserError(f"--variant {text}: {name} is a method of the bench; choose another name")
     entries: dict[str, Any] = {}
     for entry in _NEXT_ENTRY.split(rest):
@@ -142,7 +128,7 @@ def find_phototourism(places: Sequence[Path]) -> tuple[Path, ...]:
 def make_jobs(
     scenes: Sequence[Path],
     base: RunConfig,
-    methods: Sequence[BenchMethod],
+    methods: Sequence[str],
     variants: Sequence[Variant],
     seeds: Sequence[int],
     output: Path,
@@ -186,18 +172,35 @@ def _check_unique(what: str, names: Sequence[str]) -> None:
             raise UserError(f"{what}: {name} is there twice; the table needs different names")
 
 
-def method_config(method: BenchMethod, base: RunConfig) -> RunConfig:
-    """The configuration of one of the bench's methods."""
-    if method == "3dgs":
-        return replace(base, method="3dgs", model=WildGSConfig())  # on which the model has no effect
-    if method == "wildgs-half-steps":
+def label_of(name: str) -> str:
+    """How the table calls a line of the bench; ablations as the paper's table has them."""
+    if name in METHODS:
+        return method_type(name).label
+    if name.endswith(HALF):
+        return method_type(name.removesuffix(HALF)).label + "†"
+    if name in PRESETS:
+        return f"preset {name}"
+    if name in BENCH_METHODS:
+        part = name.removeprefix(WITHOUT)
+        return _ABLATION_LABELS.get(part, f"w/o {part.capitalize()}")
+    return name
+
+
+def method_config(method: str, base: RunConfig) -> RunConfig:
+    """The configuration of one of the bench's methods.
+
+    Raises:
+        UserError: There is no such method.
+    """
+    if method in METHODS:
+        return base.with_method(method)
+    if method not in BENCH_METHODS:
+        raise UserError(f"--methods {method}: unknown; choose from {', '.join(BENCH_METHODS)}")
+    if method.endswith(HALF):
         return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
-    if method == "wildgs":
-        return base
-    if method in ("paper", "fast"):
+    if method in PRESETS:
         return with_preset(base, method)
-    part = method.removeprefix("without-")
-    return with_entries(base, {"model.without": [*base.model.without, part]})
+    return with_entries(base, {"model.without": [*base.model.without, method.removeprefix(WITHOUT)]})
 
 
 def _check_stored(job: Job) -> None:

@@ -7,26 +7,24 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
+from wildgs.model.config import Ablation
+from wildgs.model.registry import DEFAULT_METHOD, METHODS
+from wildgs.presets import PRESET_NAMES
+
 ExportFormat = Literal["html", "ply", "compressed.ply", "splat", "spz", "sog"]
 """The page, and files for other programs."""
 
 Suite = Literal["phototourism"]
-BenchMethod = Literal[
-    "3dgs",
-    "wildgs-half-steps",
-    "wildgs",
-    "paper",
-    "fast",
-    "without-crop",
-    "without-reverse",
-    "without-global",
-    "without-mask",
-    "without-depth",
-    "without-intrinsic",
-    "without-local",
-]
-METHODS: tuple[BenchMethod, ...] = get_args(BenchMethod)
-"""Lines of the bench's table."""
+HALF = "-half-steps"
+WITHOUT = "without-"
+BENCH_METHODS: tuple[str, ...] = (
+    *(name for name in METHODS if name != DEFAULT_METHOD),
+    DEFAULT_METHOD + HALF,
+    DEFAULT_METHOD,
+    *(name for name in PRESET_NAMES if name != "default"),
+    *(WITHOUT + part for part in get_args(Ablation)),
+)
+"""Lines of the bench's table: methods, half of the steps, presets, and the ablations of Wild-GS."""
 
 
 @dataclass(frozen=True)

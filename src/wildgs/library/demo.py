@@ -14,12 +14,13 @@ from wildgs.library.pipeline import FinishedRun
 from wildgs.library.showcase import write_showcase
 from wildgs.library.training import read_scene, train
 from wildgs.library.webpage import write_scene_page
-from wildgs.model.config import MethodName, ParsingConfig, WildGSConfig
+from wildgs.model.config import ParsingConfig, WildGSConfig
+from wildgs.model.registry import MethodName, method_type
 from wildgs.progress import Progress
 from wildgs.runs import load_run, lock_run
 from wildgs.scene.demo import write_demo_scene
 
-TITLES: dict[MethodName, str] = {"wildgs": "Wild-GS", "3dgs": "3DGS"}
+COMPARED: tuple[MethodName, ...] = ("wildgs", "3dgs")
 TITLE = "Wild-GS demo"
 SUMMARY = (
     "A made-up landmark in {photos} rendered photos: different hours and cameras, and people in the way. Wild-GS "
@@ -60,7 +61,7 @@ def demo(
     with lock_run(output):
         folder = write_demo_scene(output / "scene")
         runs = []
-        for method in TITLES:
+        for method in COMPARED:
             config = _configuration(folder, method, steps)
             scene = read_scene(config, execution or ExecutionConfig(), progress)
             target = output / method
@@ -74,7 +75,7 @@ def demo(
                 observers=observers,
             )
             loaded = load_run(target)
-            runs.append((TITLES[method], loaded, evaluate(loaded, scene=scene, progress=progress)))
+            runs.append((method_type(method).label, loaded, evaluate(loaded, scene=scene, progress=progress)))
         write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
         write_scene_page(runs[0][1], page, TITLE, progress)
     return FinishedRun(output, {name: scores for name, _, scores in runs}, report, page)
@@ -83,4 +84,4 @@ def demo(
 def _configuration(folder: Path, method: MethodName, steps: int) -> RunConfig:
     train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=MAX_GAUSSIANS))
     model = WildGSConfig(parsing=ParsingConfig(max_side=PARSED_SIDE))
-    return RunConfig(folder.resolve(), method, model=model, train=train)
+    return RunConfig(folder.resolve(), model=model, train=train).with_method(method)

@@ -60,8 +60,8 @@ class LoadedScene:
 
     @property
     def relightable(self) -> bool:
-        """Whether the run knows more than one light; plain 3DGS does not."""
-        return self.run.config.method != "3dgs"
+        """Whether photos have a say in the colours; plain 3DGS has one light only."""
+        return self.run.method.relightable
 
     def appearance(
         self, spec: str | Path | Look, *, like: str | None = None, progress: Progress | None = None

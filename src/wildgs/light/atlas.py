@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from wildgs.light.photos import encode_view
 from wildgs.model.appearance import Embeddings
-from wildgs.model.wildgs import WildGS
+from wildgs.model.method import Method
 from wildgs.scene import View
 
 MAX_PHOTOS = 200
@@ -41,7 +41,7 @@ class Atlas:
 
 
 @torch.no_grad()
-def make_atlas(method: WildGS, views: Sequence[View], progress: Progress | None = None) -> Atlas:
+def make_atlas(method: Method, views: Sequence[View], progress: Progress | None = None) -> Atlas:
     """Encodes the training photos, `MAX_PHOTOS` at most.
 
     Args:
@@ -51,17 +51,15 @@ def make_atlas(method: WildGS, views: Sequence[View], progress: Progress | None 
     """
     count = min(len(views), MAX_PHOTOS)
     chosen = tuple(views[index * len(views) // count] for index in range(count))
-    global_embeddings, color_maps, local_mean = [], [], None
-    for number, view in enumerate(chosen, start=1):
-        embeddings = method.embed(encode_view(method, view))
-        global_embeddings.append(embeddings.global_embedding)
-        if embeddings.color_map is not None:
-            color_maps.append(embeddings.color_map)
-        local = embeddings.local_embeddings / count
-        local_mean = local if local_mean is None else local_mean.add_(local)
-        if progress is not None:
-            progress(number, count)
-    assert local_mean is not None
-    stacked = torch.stack(global_embeddings)
-    color_map = torch.stack(color_maps).mean(dim=0) if color_maps else None
-    return Atlas(chosen, stacked, Embeddings(stacked.mean(dim=0), local_mean, color_map))
+    global_embeddings: list[Tensor] = []
+
+    def encoded() -> Iterator[Embeddings]:
+        for number, view in enumerate(chosen, start=1):
+            embeddings = method.embed(encode_view(method, view))
+            global_embeddings.append(embeddings.global_embedding)
+            yield embeddings
+            if progress is not None:
+                progress(number, count)
+
+    mean = method.mean(encoded(), count)
+    return Atlas(chosen, torch.stack(global_embeddings), mean)

@@ -11,9 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings
+from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.method import Method
-from wildgs.model.wildgs import WildGS
 
 NEUTRAL = "neutral"
 """The name of the mean light."""
@@ -28,13 +27,13 @@ class Look:
 
     Attributes:
         name: For people and for file names.
-        embeddings: What `mix` mixes; None for a method that has one light only (plain 3DGS).
+        embeddings: What `mix` mixes.
         method: The trained method to which the embeddings belong.
         note: How the light was found, where that is worth a line to the user.
     """
 
     name: str
-    embeddings: Embeddings | None = field(repr=False)
+    embeddings: Embeddings = field(repr=False)
     method: Method = field(repr=False)
     note: str = ""
 
@@ -42,23 +41,18 @@ class Look:
     def sh(self) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics of all Gaussians under this light, on the method's device; shaded once, then kept."""
         with torch.no_grad():
-            if self.embeddings is None:
-                return self.method.shade(Appearance())
-            if not isinstance(self.method, WildGS):
-                raise TypeError(f"a {type(self.method).__name__} cannot be lit by embeddings")
             return self.method.fuse(self.embeddings)
 
 
 @torch.no_grad()
 def look_of(method: Method, appearance: Appearance, name: str, note: str = "") -> Look:
     """The look of an encoded photo."""
-    embeddings = method.embed(appearance) if isinstance(method, WildGS) else None
-    return Look(name, embeddings, method, note)
+    return Look(name, method.embed(appearance), method, note)
 
 
 def own_look(method: Method) -> Look:
-    """The one look of a method without appearance."""
-    return Look("own light", None, method)
+    """The one look of a method that is not relightable."""
+    return look_of(method, Appearance(), "own light")
 
 
 def mix(
@@ -87,11 +81,11 @@ def mix(
         raise UserError("these appearances belong to different scenes; mix those of one loaded scene")
     weights = _checked(looks, weights)
     local = weights if local_weights is None else _checked(looks, local_weights)
-    if first.embeddings is None:
+    if not first.method.relightable:
         return first
-    parts = [look.embeddings for look in looks if look.embeddings is not None]
+    parts = [look.embeddings for look in looks]
     name = name or _describe(looks, weights, local)
-    return Look(name, blend_embeddings(parts, weights, local), first.method)
+    return Look(name, first.method.mix(parts, weights, local), first.method)
 
 
 def _checked(looks: Sequence[Look], weights: Sequence[float | int]) -> list[float]:

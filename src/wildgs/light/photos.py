@@ -21,7 +21,7 @@ def encode_view(method: Method, view: View) -> Appearance:
     """The appearance of one of the scene's own photos."""
     device = method.gaussians.means.device
     photo, keep = view.load(device)
-    return method.encode(photo, view.camera.to(device), keep)
+    return method.encode(photo, view.camera.to(device), keep, name=view.name)
 
 
 @torch.no_grad()

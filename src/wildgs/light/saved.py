@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +16,6 @@ from wildgs.files import written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
 from wildgs.model.method import Method
-from wildgs.model.wildgs import WildGS
 
 SUFFIX = ".safetensors"
 FORMAT = "wildgs-appearance-2"
@@ -33,25 +31,15 @@ def save_look(look: Look, file: Path) -> Path:
         UserError: The look is of a run that has one light only, the name does not end as it must, or the disk is
             full or read-only.
     """
-    if look.embeddings is None:
-        raise UserError("this run is plain 3dgs: it has one light, its own, and nothing to save")
+    if not look.method.relightable:
+        raise UserError(f"{look.method.label} cannot be relit; there is no appearance to save")
     if file.suffix != SUFFIX:
         raise UserError(f"{file}: appearance files end in {SUFFIX}")
-    local = look.embeddings.local_embeddings.detach().cpu()
-    shared = local.mode(dim=0).values
-    rows = (local != shared).any(dim=1).nonzero()[:, 0]
-    color_map = look.embeddings.color_map
-    tensors = {
-        "color_map": torch.zeros(3, 4) if color_map is None else color_map.detach().cpu().contiguous(),
-        "global_embedding": look.embeddings.global_embedding.detach().cpu().float().contiguous(),
-        "shared_local": shared.contiguous(),
-        "rows": rows.to(torch.int32),
-        "local_embeddings": local[rows].half().contiguous(),
-    }
+    tensors = _packed(look.embeddings)
     header = {
         "format": FORMAT,
         "name": look.name,
-        "run": fingerprint(look.method),
+        "run": look.method.fingerprint(),
     }
     with written_aside(file) as aside:
         aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
@@ -73,7 +61,7 @@ def load_look(method: Method, file: Path) -> Look:
                 raise KeyError("format")
             tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
         name, owner = str(header["name"]), header["run"]
-        if not isinstance(method, WildGS) or owner != fingerprint(method):
+        if not method.relightable or owner != method.fingerprint():
             raise UserError(
                 f"{file}: was made with another run, or another step of this one; make it anew with "
                 "`wildgs appearance`"
@@ -83,38 +71,54 @@ def load_look(method: Method, file: Path) -> Look:
         raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
 
 
-def _fitting(method: WildGS, tensors: Mapping[str, Tensor]) -> Embeddings:
+def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
+    """Embeddings as the file's tensors."""
+    color_map = embeddings.color_map
+    tensors = {
+        "color_map": torch.zeros(3, 4) if color_map is None else color_map.detach().cpu().contiguous(),
+        "global_embedding": embeddings.global_embedding.detach().cpu().float().contiguous(),
+    }
+    if embeddings.local_embeddings is None:
+        return tensors
+    local = embeddings.local_embeddings.detach().cpu()
+    shared = local.mode(dim=0).values
+    rows = (local != shared).any(dim=1).nonzero()[:, 0]
+    return tensors | {
+        "shared_local": shared.contiguous(),
+        "rows": rows.to(torch.int32),
+        "local_embeddings": local[rows].half().contiguous(),
+    }
+
+
+def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     """A file's embeddings for a method's Gaussians.
 
     Raises:
         KeyError: One is missing.
-        ValueError: They do not fit the method, or are no finite numbers.
+        ValueError: They do not fit the method, or are not finite.
     """
-    count, outside = len(method.gaussians), method.wrapping.outside
-    shared, rows = tensors["shared_local"].float(), tensors["rows"]
-    common, inside = tensors["global_embedding"].float(), tensors["local_embeddings"].float()
-    color_map = tensors["color_map"].float()
-    if common.shape != (method.fusion.first_global.in_features,) or shared.shape != outside.shape:
+    device = method.gaussians.means.device
+    common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
+    if common.shape != (method.global_size,):
         raise ValueError("embeddings of another length")
-    if rows.dtype != torch.int32 or rows.dim() != 1 or inside.shape != (len(rows), *outside.shape):
+    if color_map.shape != (3, 4):
+        raise ValueError("a colour map of another shape")
+    local = _local_embeddings(method, tensors) if method.local_size else None
+    if not all(bool(values.isfinite().all()) for values in (common, color_map, local) if values is not None):
+        raise ValueError("embeddings that are not finite")
+    return Embeddings(common.to(device), None if local is None else local.to(device), color_map.to(device))
+
+
+def _local_embeddings(method: Method, tensors: Mapping[str, Tensor]) -> Tensor:
+    count, length = len(method.gaussians), (method.local_size,)
+    shared, rows = tensors["shared_local"].float(), tensors["rows"]
+    inside = tensors["local_embeddings"].float()
+    if shared.shape != length:
+        raise ValueError("embeddings of another length")
+    if rows.dtype != torch.int32 or rows.dim() != 1 or inside.shape != (len(rows), *length):
         raise ValueError("rows without embeddings")
     if bool(((rows < 0) | (rows >= count)).any()):
         raise ValueError("rows of no Gaussian")
-    if color_map.shape != (3, 4):
-        raise ValueError("a colour map of another shape")
-    if not all(bool(values.isfinite().all()) for values in (common, shared, inside, color_map)):
-        raise ValueError("embeddings that are no numbers")
     local = shared.repeat(count, 1)
     local[rows.long()] = inside
-    return Embeddings(common.to(outside.device), local.to(outside.device), color_map.to(outside.device))
-
-
-def fingerprint(method: Method) -> str:
-    """What tells one trained state from another: a digest of the centres and the fusion network."""
-    digest = hashlib.sha256()
-    state = method.state_dict()
-    for key in sorted(state):
-        if key.startswith("fusion.") or key == "gaussians.rows.means":
-            digest.update(key.encode())
-            digest.update(state[key].detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:32]
+    return local

@@ -20,7 +20,6 @@ from wildgs.light.look import NEUTRAL, Look, look_of, own_look
 from wildgs.light.photos import encode_photo, encode_picture, encode_view
 from wildgs.light.saved import SUFFIX, load_look
 from wildgs.model.method import Method
-from wildgs.model.wildgs import WildGS
 from wildgs.scene import Scene, View, find_view, match_view
 from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.sfm.feature_index import FeatureIndex, load_feature_index
@@ -28,8 +27,6 @@ from wildgs.sfm.localization import LocalizationError, localize
 
 AUTO = "auto"
 """As `like`: the training photo whose global embedding is nearest."""
-
-ONE_LIGHT = "the run is plain 3dgs, which has one light, its own, whatever photo is given"
 
 KEPT_LOOKS = 16
 KEPT_BYTES = 2_000_000_000
@@ -84,27 +81,28 @@ class LightSources:
         Raises:
             UserError: There is no such photo or file, or it cannot be read.
         """
-        if not isinstance(self.method, WildGS):
+        if not self.method.relightable:
             if spec != NEUTRAL:
-                warnings.warn(f"{spec}: {ONE_LIGHT}", WildGSWarning, stacklevel=2)
+                message = f"{self.method.label} cannot be relit; the appearance {spec} is ignored"
+                warnings.warn(message, WildGSWarning, stacklevel=2)
             return self._own
         key = (str(spec), like, _stamp(Path(spec)))
         if key not in self._kept:
-            self._kept[key] = self._make(self.method, str(spec), like, progress or _silent)
+            self._kept[key] = self._make(str(spec), like, progress or _silent)
         self._kept.move_to_end(key)
         size = 4 * 3 * (self.method.sh_degree + 1) ** 2 * self.method.num_gaussians
         while len(self._kept) > max(2, min(KEPT_LOOKS, KEPT_BYTES // max(size, 1))):
             self._kept.popitem(last=False)
         return self._kept[key]
 
-    def _make(self, method: WildGS, spec: str, like: str | None, progress: Progress) -> Look:
+    def _make(self, spec: str, like: str | None, progress: Progress) -> Look:
         if spec == NEUTRAL:
-            return Look(NEUTRAL, self.atlas(progress).mean, method)
+            return Look(NEUTRAL, self.atlas(progress).mean, self.method)
         if spec.endswith(SUFFIX):
-            return load_look(method, Path(spec))
+            return load_look(self.method, Path(spec))
         view = match_view(self.scene.views, spec)
         if view is not None:
-            return look_of(method, encode_view(method, view), view.name)
+            return look_of(self.method, encode_view(self.method, view), view.name)
         file = Path(spec)
         if not is_file(file):
             raise UserError(
@@ -113,12 +111,12 @@ class LightSources:
             )
         if like is None:
             try:
-                return self._locate(method, file, progress)
+                return self._locate(file, progress)
             except LocalizationError as error:
                 failure = str(error)
         else:
             failure = ""
-        look = self._borrow(method, file, like or AUTO, progress)
+        look = self._borrow(file, like or AUTO, progress)
         if failure:
             warnings.warn(
                 f"{failure}; taken for a picture of another place: {look.note} (--like chooses another)",
@@ -127,7 +125,7 @@ class LightSources:
             )
         return look
 
-    def _locate(self, method: WildGS, file: Path, progress: Progress) -> Look:
+    def _locate(self, file: Path, progress: Progress) -> Look:
         """The look of a new photo of the place."""
         if self._landmarks is None:
             self._landmarks = load_feature_index(
@@ -137,26 +135,24 @@ class LightSources:
             )
         long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
         found = localize(file, self._landmarks, long_side)
-        appearance = encode_photo(method, found.photo, found.camera)
-        return look_of(method, appearance, file.name, found.describe())
+        appearance = encode_photo(self.method, found.photo, found.camera)
+        return look_of(self.method, appearance, file.name, found.describe())
 
-    def _borrow(self, method: WildGS, file: Path, like: str, progress: Progress) -> Look:
+    def _borrow(self, file: Path, like: str, progress: Progress) -> Look:
         """The look of any picture, through the camera of a photo of the scene."""
         picture = read_picture(file)
-        lender = find_view(self.scene, like) if like != AUTO else self._most_alike(method, picture, progress)
-        appearance = encode_picture(method, picture, lender.camera)
-        return look_of(method, appearance, file.name, f"camera and depth borrowed from {lender.name}")
+        lender = find_view(self.scene, like) if like != AUTO else self._most_alike(picture, progress)
+        appearance = encode_picture(self.method, picture, lender.camera)
+        return look_of(self.method, appearance, file.name, f"camera and depth borrowed from {lender.name}")
 
-    def _most_alike(self, method: WildGS, picture: UInt8[Tensor, "H W 3"], progress: Progress) -> View:
+    def _most_alike(self, picture: UInt8[Tensor, "H W 3"], progress: Progress) -> View:
         atlas = self.atlas(progress)
-        appearance = encode_picture(method, picture, atlas.views[0].camera)
-        assert appearance.global_embedding is not None
-        return atlas.most_alike(appearance.global_embedding)
+        appearance = encode_picture(self.method, picture, atlas.views[0].camera)
+        return atlas.most_alike(self.method.embed(appearance).global_embedding)
 
     def atlas(self, progress: Progress | None = None) -> Atlas:
         """The light of all training photos; made once."""
         if self._atlas is None:
-            assert isinstance(self.method, WildGS)
             tell = progress or _silent
             self._atlas = make_atlas(
                 self.method,

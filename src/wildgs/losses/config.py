@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -14,7 +15,9 @@ class ObjectiveConfig:
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
         depth_weight: λ^D (paper: 0.05).
-        mask_threshold: Th, above which a pixel counts as static for the depth loss.
+        mask_gradient: What the mask learns from in the image loss. 'loss': the formula's own gradient, as printed;
+            'evidence': what the pixel shows (`wildgs.losses.photometric.transient_evidence`). The value of the loss
+            and its gradient to the render are the same.
         min_alpha: Least accumulated alpha of a pixel whose rendered depth is compared.
     """
 
@@ -22,7 +25,7 @@ class ObjectiveConfig:
     mask_weight_start: float = 0.4
     mask_weight_end: float = 0.1
     depth_weight: float = 0.01
-    mask_threshold: float = 0.5
+    mask_gradient: Literal["evidence", "loss"] = "evidence"
     min_alpha: float = 0.5
 
     def mask_weight(self, progress: float) -> float:

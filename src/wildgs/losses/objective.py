@@ -55,6 +55,7 @@ def total_loss(
     disparity: Float[Tensor, "H W"] | None = None,
     observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
+    mask_threshold: float = 0.5,
 ) -> Losses:
     """The paper's L_total for one photo.
 
@@ -71,6 +72,7 @@ def total_loss(
         observations: Pixels (x, y) at which the photo shows triangulated points: the mask learns that these are
             static.
         train_mask: False passes no gradient to the mask (the pause after an opacity reset).
+        mask_threshold: Th: the depth loss leaves out pixels whose M is not above it.
 
     Returns:
         All terms.
@@ -78,8 +80,7 @@ def total_loss(
     if visibility is not None and not train_mask:
         visibility = visibility.detach()
     proven = None if observations is None else proven_static(observations, *photo.shape[:2])
-    kept = _kept(visibility, keep, photo)
-    image = masked_photometric(photo, render, kept, config.weight_l1, proven=proven)
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
@@ -88,12 +89,22 @@ def total_loss(
     if depth is not None and disparity is not None:
         selection = torch.ones_like(depth, dtype=torch.bool) if keep is None else keep
         if visibility is not None:
-            selection = selection & (visibility.detach() > config.mask_threshold)
+            selection = selection & (visibility.detach() > mask_threshold)
         if alpha is not None:
             selection = selection & (alpha.detach() > config.min_alpha)
         depth_term = depth_correlation(depth, disparity, selection)
         total = total + config.depth_weight * depth_term
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
+
+
+def _image_loss(
+    config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None, proven: Tensor | None
+) -> Tensor:
+    """L^I; its gradient to the mask is the formula's or the evidence, as configured."""
+    if mask is None or config.mask_gradient == "evidence":
+        return masked_photometric(photo, render, mask, config.weight_l1, proven=proven)
+    mask = mask[..., None]
+    return masked_photometric(photo * mask, render * mask, None, config.weight_l1)
 
 
 def _kept(visibility: Tensor | None, keep: Tensor | None, photo: Tensor) -> Tensor | None:

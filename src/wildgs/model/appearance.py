@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,13 +32,13 @@ class Embeddings:
     """Appearance carried to the Gaussians: what `fuse` takes and what tuning mixes.
 
     Attributes:
-        global_embedding: Emb^g.
-        local_embeddings: Emb^l per Gaussian.
+        global_embedding: Emb^g; empty for a method that is not relightable.
+        local_embeddings: Emb^l per Gaussian; None for a method without local appearance.
         color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none.
     """
 
     global_embedding: Float[Tensor, " G"]
-    local_embeddings: Float[Tensor, "N L"]
+    local_embeddings: Float[Tensor, "N L"] | None = None
     color_map: Float[Tensor, "3 4"] | None = None
 
 
@@ -55,11 +55,29 @@ def blend_embeddings(
         local_weights: Weights of the local embeddings where they differ.
     """
     local_weights = weights if local_weights is None else local_weights
+    local = [part.local_embeddings for part in parts if part.local_embeddings is not None]
     return Embeddings(
         _weighted([part.global_embedding for part in parts], weights),
-        _weighted([part.local_embeddings for part in parts], local_weights),
+        _weighted(local, local_weights) if local else None,
         _mixed_maps(parts, weights),
     )
+
+
+def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
+    """The mean of `count` embeddings, of which one at a time is in memory.
+
+    Of colour maps it is the mean over the parts that have one.
+    """
+    total_global, maps, local_mean = [], [], None
+    for part in parts:
+        total_global.append(part.global_embedding)
+        if part.color_map is not None:
+            maps.append(part.color_map)
+        if part.local_embeddings is not None:
+            local = part.local_embeddings / count
+            local_mean = local if local_mean is None else local_mean.add_(local)
+    color_map = torch.stack(maps).mean(dim=0) if maps else None
+    return Embeddings(torch.stack(total_global).mean(dim=0), local_mean, color_map)
 
 
 def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 4"] | None:

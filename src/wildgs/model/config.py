@@ -1,4 +1,4 @@
-"""Configuration of Wild-GS: plain dataclasses, importable without torch."""
+"""Configuration of Wild-GS and plain 3DGS: plain dataclasses, importable without torch."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ SQUEEZENET = "squeezenet"
 RESNET18 = "microsoft/resnet-18"
 
 Precision = Literal["auto", "float32", "bfloat16"]
-MethodName = Literal["wildgs", "3dgs"]
 Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "local"]
-"""Parts that can be taken away: the paper's five, and the intrinsic and local features."""
+"""Parts that can be left out: the paper's five ablations, and the intrinsic and local features."""
 
 
 WRAPPING_RANGES = {
@@ -42,6 +41,8 @@ class ParsingConfig:
             what five stages leave of a photo says little of its colour cast.
         global_size: Length of the global embedding (paper: 16).
         decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
+        bounded_logits: Whether M stays where its sigmoid passes a gradient, so that masks which closed or opened
+            everywhere can come back. Not in the paper.
     """
 
     encoder: str = SQUEEZENET
@@ -49,6 +50,7 @@ class ParsingConfig:
     color_statistics: bool = True
     global_size: int = 16
     decoder_widths: tuple[int, int, int] = (128, 64, 32)
+    bounded_logits: bool = True
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,8 @@ class FusionConfig:
         output_scale: Factor on the output layer's initial weights.
         color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
             exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
+        direct_path: Whether a linear path from the intrinsic feature to the output runs beside the hidden layers:
+            training then begins at the points' colours. Not in the paper.
     """
 
     intrinsic_size: int = 32
@@ -103,6 +107,18 @@ class FusionConfig:
     sh_degree: int = 1
     output_scale: float = 0.1
     color_transform: bool = True
+    direct_path: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuses sizes that no network can have."""
+        if self.intrinsic_size < 3:
+            raise UserError(
+                f"intrinsic_size {self.intrinsic_size}: must be 3 or more, since it holds a Gaussian's first colour"
+            )
+        if self.hidden < 1:
+            raise UserError(f"hidden {self.hidden}: must be 1 or more")
+        if not 0 <= self.sh_degree <= 3:
+            raise UserError(f"sh_degree {self.sh_degree}: must be between 0 and 3")
 
 
 @dataclass(frozen=True)
@@ -127,8 +143,59 @@ class SkyConfig:
 
 
 @dataclass(frozen=True)
+class InitialConfig:
+    """Gaussians at the start beside those on SfM points. None of them is in the paper.
+
+    Attributes:
+        depth_points: On surfaces that depth priors show and SfM has no points of.
+        ground: That continue the ground.
+        sky: That stand for the sky.
+    """
+
+    depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
+    ground: GroundConfig = field(default_factory=GroundConfig)
+    sky: SkyConfig = field(default_factory=SkyConfig)
+
+    @classmethod
+    def sfm_only(cls) -> InitialConfig:
+        """SfM points alone, as 3DGS starts."""
+        return cls(DepthPointsConfig(points=0), GroundConfig(points=0), SkyConfig(points=0))
+
+
+@dataclass(frozen=True)
+class LearningRate:
+    """A learning rate that decays exponentially.
+
+    Attributes:
+        start: At the first step.
+        decay: Factor reached at the last step; 1 keeps the rate constant.
+    """
+
+    start: float
+    decay: float = 1.0
+
+
+@dataclass(frozen=True)
+class WildGSRates:
+    """Learning rates of what plain 3DGS does not have.
+
+    Attributes:
+        intrinsic: Intrinsic features, at the start.
+        networks: All networks but the encoder, at the start.
+        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
+            thousand steps, and the embedding of every photo becomes the same.
+        decay: Factor that all three reach at the end, exponentially.
+    """
+
+    intrinsic: float = 2.5e-3
+    networks: float = 1e-3
+    encoder: float = 1e-4
+    decay: float = 0.1
+
+
+@dataclass(frozen=True)
 class WildGSConfig:
-    """The model.
+    """Wild-GS.
 
     Attributes:
         without: Parts left out, for ablations.
@@ -141,6 +208,7 @@ class WildGSConfig:
         sky: Gaussians that stand for the sky at the start.
         color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
             scene's colours under that are from the photo's. Not in the paper.
+        learning_rates: Of networks and intrinsic features.
     """
 
     without: tuple[Ablation, ...] = ()
@@ -152,3 +220,28 @@ class WildGSConfig:
     ground: GroundConfig = field(default_factory=GroundConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
+    learning_rates: WildGSRates = field(default_factory=WildGSRates)
+
+
+@dataclass(frozen=True)
+class VanillaRates:
+    """Learning rates of the harmonics; values are 3DGS's.
+
+    Attributes:
+        sh0: Flat colour.
+        shN: Higher harmonics.
+    """
+
+    sh0: float = 2.5e-3
+    shN: float = 1.25e-4  # noqa: N815 - the field's name
+
+
+@dataclass(frozen=True)
+class VanillaConfig:
+    """Plain 3D Gaussian Splatting.
+
+    Attributes:
+        learning_rates: Of the harmonics.
+    """
+
+    learning_rates: VanillaRates = field(default_factory=VanillaRates)

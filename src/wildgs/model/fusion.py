@@ -11,6 +11,9 @@ from wildgs.model.config import FusionConfig
 from wildgs.model.precision import MixedModule
 from wildgs.model.split_linear import linear_over_rows
 
+COLOR_CHANNELS = 3
+MAX_SH_DEGREE = 3
+
 
 class Fusion(MixedModule):
     """sh_i = M^F(Emb^g ⊕ Emb^l_i ⊕ f^in_i), shared by all Gaussians.
@@ -30,12 +33,13 @@ class Fusion(MixedModule):
         self.first_rows = nn.Linear(local_size + config.intrinsic_size, config.hidden, bias=False)
         self.second = nn.Linear(config.hidden, config.hidden)
         self.output = nn.Linear(config.hidden, outputs)
-        self.direct = nn.Linear(config.intrinsic_size, outputs, bias=False)
+        self.direct = nn.Linear(config.intrinsic_size, outputs, bias=False) if config.direct_path else None
         with torch.no_grad():
             self.output.weight.mul_(config.output_scale)
             self.output.bias.zero_()
-            self.direct.weight.zero_()
-            self.direct.weight[:3, :3] = torch.eye(3)
+            if self.direct is not None:
+                self.direct.weight.zero_()
+                self.direct.weight[:3, :3] = torch.eye(3)
         self.transform = nn.Linear(global_size, 12) if config.color_transform else None
         if self.transform is not None:
             nn.init.zeros_(self.transform.weight)
@@ -72,8 +76,10 @@ class Fusion(MixedModule):
             hidden = linear_over_rows(rows, self.first_rows.weight, of_all).relu_()
             hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
             fused = linear_over_rows(hidden, output, bias)
-        # The direct path carries the base colour and stays in full precision.
-        return torch.addmm(fused.float(), intrinsic, direct.T).reshape(-1, self.coefficients, 3)
+        fused = fused.float()
+        if direct is not None:  # it carries the base colour and stays in full precision
+            fused = torch.addmm(fused, intrinsic, direct.T)
+        return fused.reshape(-1, self.coefficients, 3)
 
     def _change(
         self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None
@@ -89,12 +95,13 @@ class Fusion(MixedModule):
 
     def _last_layers(
         self, change: Float[Tensor, "3 4"] | None
-    ) -> tuple[Float[Tensor, "O H"], Float[Tensor, "O I"], Float[Tensor, " O"]]:
+    ) -> tuple[Float[Tensor, "O H"], Float[Tensor, "O I"] | None, Float[Tensor, " O"]]:
         """Weights of the output and the direct path, and their bias, with a change of colours taken in.
 
         All three are linear, so that colours ``c + A c + b`` cost no pass over the Gaussians.
         """
-        output, direct, bias = self.output.weight, self.direct.weight, self.output.bias
+        output, bias = self.output.weight, self.output.bias
+        direct = None if self.direct is None else self.direct.weight
         if change is None:
             return output, direct, bias
         matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:, :3]
@@ -105,4 +112,5 @@ class Fusion(MixedModule):
             return (matrix @ weight.reshape(self.coefficients, 3, -1)).reshape(weight.shape)
 
         offset = torch.cat([flat, flat.new_zeros(3 * self.coefficients - 3)])
-        return colors_mapped(output), colors_mapped(direct), colors_mapped(bias[:, None])[:, 0] + offset
+        mapped = None if direct is None else colors_mapped(direct)
+        return colors_mapped(output), mapped, colors_mapped(bias[:, None])[:, 0] + offset

@@ -112,7 +112,8 @@ class Parsing(MixedModule):
         else:
             coarse, embedding = function(image, *settings)
         logits = functional.interpolate(coarse, size=photo.shape[:2], mode="bilinear", align_corners=False)
-        return _Bounded.apply(logits[0, 0]).sigmoid(), embedding
+        bounded = _Bounded.apply(logits[0, 0]) if self.config.bounded_logits else logits[0, 0]
+        return bounded.sigmoid(), embedding
 
     def _networks(
         self, image: Float[Tensor, "1 3 h w"], learn_encoder: bool, learn_mask: bool

@@ -1,62 +1,110 @@
-"""Methods by name: how each starts from points, and how each comes back from a checkpoint."""
+"""Methods by name. A new method is a file of its own and one line here.
+
+Classes are imported when they are first asked for, so that the command line can list methods without torch.
+"""
 
 from __future__ import annotations
 
-import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from wildgs.errors import UserError
-from wildgs.model.config import MethodName
-from wildgs.model.encoder import encoder_of
-from wildgs.model.gaussians import Gaussians
-from wildgs.model.method import Method
-from wildgs.model.triplane import Box
-from wildgs.model.vanilla import VanillaGS
-from wildgs.model.wildgs import ColoredPoints, WildGS, WildGSConfig
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from wildgs.model.method import Method
+    from wildgs.scene import Scene
+
+
+@dataclass(frozen=True)
+class Registered:
+    """Where a method is, as ``module:name`` within this package.
+
+    Attributes:
+        method: The class.
+        config: Its configuration, where that can be imported without torch; None takes the class's own.
+    """
+
+    method: str
+    config: str | None = None
+
+
+METHODS: dict[str, Registered] = {
+    "wildgs": Registered("wildgs.model.wildgs:WildGS", "wildgs.model.config:WildGSConfig"),
+    "3dgs": Registered("wildgs.model.vanilla:VanillaGS", "wildgs.model.config:VanillaConfig"),
+    "affine": Registered("wildgs.model.affine:AffineGS"),
+}
+"""All methods; the first one is the default."""
+
+DEFAULT_METHOD = next(iter(METHODS))
+MethodName = str
+"""A key of `METHODS`."""
 _ROWS = "gaussians.rows."
 
 
+def _find(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+def _registered(name: MethodName) -> Registered:
+    if name not in METHODS:
+        raise UserError(f"method {name!r}: unknown; choose one of {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def method_type(name: MethodName) -> type[Method]:
+    """The class of a method.
+
+    Raises:
+        UserError: There is no such method.
+    """
+    return _find(_registered(name).method)
+
+
+def config_type(name: MethodName) -> type:
+    """The dataclass of a method's options.
+
+    Raises:
+        UserError: There is no such method.
+    """
+    place = _registered(name).config
+    return method_type(name).Config if place is None else _find(place)
+
+
 def create_method(
-    name: MethodName,
-    config: WildGSConfig,
-    points: Float[Tensor, "P 3"],
-    colors: UInt8[Tensor, "P 3"],
-    dense: ColoredPoints | None = None,
-    ground: ColoredPoints | None = None,
+    name: MethodName, config: Any, scene: Scene, *, max_gaussians: int = 3_000_000, seed: int = 0
 ) -> Method:
     """A method at its start.
 
     Args:
         name: Which method.
-        config: Used by `wildgs` alone.
-        points: Sparse SfM points in the scene's aligned frame.
-        colors: Their colours.
-        dense: Further points with colours that `wildgs` alone starts from.
-        ground: Where the ground goes on, likewise.
+        config: Its configuration; None for the defaults.
+        scene: Where its first Gaussians come from.
+        max_gaussians: Bound on their number.
+        seed: Of random choices among points.
     """
-    if name == "3dgs":
-        return VanillaGS.from_points(points, colors)
-    return WildGS.from_points(config, points, colors, dense=dense, ground=ground)
+    from wildgs.model.initial import initial_gaussians
+
+    method = method_type(name)
+    config = method.Config() if config is None else config
+    return method.create(config, initial_gaussians(scene, method.initial(config), max_gaussians, seed))
 
 
-def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tensor]) -> Method:
+def restore_method(name: MethodName, config: Any, state: dict[str, Tensor]) -> Method:
     """A method as `Method.state_dict` described it; reads no pretrained weights.
 
     Raises:
         UserError: The tensors do not belong to this method and configuration.
     """
+    from wildgs.model.gaussians import Gaussians
+
     try:
         rows = {key.removeprefix(_ROWS): value for key, value in state.items() if key.startswith(_ROWS)}
-        _check_rows(rows, name, config)
-        gaussians = Gaussians(rows)
-        if name == "3dgs":
-            method: Method = VanillaGS(gaussians)
-        else:
-            box = Box(torch.zeros(3), torch.ones(3))
-            encoder = encoder_of(state, "parsing.encoder.")
-            method = WildGS(config, gaussians, box, encoder)
+        _check_rows(rows, method_type(name).rows(config))
+        method = method_type(name).blank(config, Gaussians(rows), state)
         method.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
         first = str(error).splitlines()[0]
@@ -64,23 +112,13 @@ def restore_method(name: MethodName, config: WildGSConfig, state: dict[str, Tens
     return method
 
 
-def _check_rows(rows: dict[str, Tensor], name: MethodName, config: WildGSConfig) -> None:
-    """Whether all rows are there, each with its width and all with one length.
+def _check_rows(rows: dict[str, Tensor], shapes: dict[str, tuple[int, ...]]) -> None:
+    """Checks that all rows are there, each with its shape and all with one length.
 
     Raises:
         KeyError: A row is missing.
         RuntimeError: A row has another shape.
     """
-    shapes: dict[str, tuple[int, ...]] = {
-        "means": (3,),
-        "quats": (4,),
-        "log_scales": (3,),
-        "opacity_logits": (),
-    }
-    if name == "3dgs":
-        shapes |= {"sh0": (1, 3), "shN": ((VanillaGS.sh_degree + 1) ** 2 - 1, 3)}
-    else:
-        shapes["intrinsic"] = (config.fusion.intrinsic_size,)
     count = rows["means"].shape[0]
     for row, shape in shapes.items():
         if rows[row].shape != (count, *shape):

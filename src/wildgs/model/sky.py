@@ -13,29 +13,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.model.config import SkyConfig
-from wildgs.model.gaussians import geometry_from_points
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 COLOR = 0.75
 
 
-def sky_rows(config: SkyConfig, points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
-    """Geometry of the sky's Gaussians.
+def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor, "S 3"]:
+    """Centres of the sky's Gaussians.
 
     Args:
         config: The shell.
         points: The scene's SfM points in the aligned frame, +z up.
-
-    Returns:
-        Rows as `geometry_from_points` gives them.
     """
     centre = points.median(dim=0).values
     distances = (points - centre).norm(dim=1).sort().values
     reach = float(distances[round(0.98 * (len(distances) - 1))])
     radius = max(config.radius, config.reach * reach)
-    rows = geometry_from_points(centre + radius * shell_directions(config.points, config.lowest))
-    rows["opacity_logits"] = torch.full((config.points,), config.opacity).logit()
-    return rows
+    return centre + radius * shell_directions(config.points, config.lowest)
 
 
 def shell_directions(count: int, lowest: float) -> Float[Tensor, "count 3"]:

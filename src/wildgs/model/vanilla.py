@@ -2,33 +2,72 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
-from wildgs.model.appearance import Appearance
-from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_points
-from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
+from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.config import LearningRate, VanillaConfig
+from wildgs.model.gaussians import Gaussians
+from wildgs.model.initial import InitialGaussians
+from wildgs.model.method import (
+    GEOMETRY_ROWS,
+    MemoryUse,
+    Method,
+    Stage,
+    TrainingOutput,
+    paint_visible,
+)
 from wildgs.model.rows import take_rows
 from wildgs.rasterize import blend
+
+SH_DEGREE = 3
 
 
 class VanillaGS(Method):
     """Every Gaussian owns its spherical harmonics; photos have no say in the colours."""
 
-    def __init__(self, gaussians: Gaussians) -> None:
+    name: ClassVar[str] = "3dgs"
+    label: ClassVar[str] = "3DGS"
+    Config: ClassVar[type] = VanillaConfig
+    memory: ClassVar[MemoryUse] = MemoryUse(per_gaussian=2500, per_pixel=300, fixed=100 * 2**20)
+    relightable: ClassVar[bool] = False
+    config: VanillaConfig
+
+    def __init__(self, config: VanillaConfig, gaussians: Gaussians) -> None:
         super().__init__()
+        self.config = config
         self.gaussians = gaussians
+        self.sh_degree = SH_DEGREE
 
     @classmethod
-    def from_points(cls, points: Float[Tensor, "P 3"], colors: UInt8[Tensor, "P 3"]) -> VanillaGS:
-        """Starts from SfM points and their colours."""
-        rows = geometry_from_points(points)
-        rows["sh0"] = rgb_to_sh0(colors_to_unit(colors))[:, None]
-        rows["shN"] = torch.zeros(len(points), (cls.sh_degree + 1) ** 2 - 1, 3)
-        return cls(Gaussians(rows))
+    def rows(cls, config: VanillaConfig) -> dict[str, tuple[int, ...]]:
+        """Geometry and harmonics."""
+        return GEOMETRY_ROWS | {"sh0": (1, 3), "shN": ((SH_DEGREE + 1) ** 2 - 1, 3)}
+
+    @classmethod
+    def create(cls, config: VanillaConfig, initial: InitialGaussians) -> VanillaGS:
+        """Starts from the points' colours."""
+        harmonics = {
+            "sh0": rgb_to_sh0(initial.colors)[:, None],
+            "shN": torch.zeros(len(initial.colors), *cls.rows(config)["shN"]),
+        }
+        return cls(config, Gaussians(initial.rows | harmonics))
+
+    @classmethod
+    def blank(cls, config: VanillaConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> VanillaGS:
+        """The Gaussians are all there is."""
+        return cls(config, gaussians)
+
+    def row_rates(self) -> dict[str, LearningRate]:
+        """Those of the harmonics."""
+        rates = self.config.learning_rates
+        return {"sh0": LearningRate(rates.sh0), "shN": LearningRate(rates.shN)}
 
     def encode(
         self,
@@ -36,12 +75,18 @@ class VanillaGS(Method):
         camera: Camera,
         keep: Bool[Tensor, "H W"] | None = None,
         *,
+        name: str | None = None,
         trust_mask: bool = True,
+        explicit: bool = True,
     ) -> Appearance:
         """Nothing: this method knows one light only."""
         return Appearance()
 
-    def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
+    def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
+        """An empty embedding."""
+        return Embeddings(self.gaussians.means.new_zeros(0))
+
+    def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """The stored harmonics."""
         stored = self.gaussians.rows
         parts = [stored["sh0"], stored["shN"]]

@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.color_match import match_colors
-from wildgs.model.config import Ablation, WildGSConfig
-from wildgs.model.encoder import Encoder
+from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
+from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
-from wildgs.model.gaussians import Gaussians, colors_to_unit, geometry_from_points
-from wildgs.model.ground import ground_rows
+from wildgs.model.gaussians import Gaussians
+from wildgs.model.initial import InitialGaussians
 from wildgs.model.lifting import lift, liftable, random_part
-from wildgs.model.method import Method, Stage, TrainingOutput, paint_visible
+from wildgs.model.method import (
+    GEOMETRY_ROWS,
+    MemoryUse,
+    Method,
+    ParameterGroup,
+    Stage,
+    TrainingOutput,
+    paint_visible,
+)
 from wildgs.model.parsing import Parsing
 from wildgs.model.rows import take_rows
-from wildgs.model.sky import COLOR as SKY_COLOR
-from wildgs.model.sky import sky_rows
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping
 from wildgs.rasterize import Projection, blend
 
-ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
-"""Positions in the aligned frame, and 8-bit colours."""
-
 
 class WildGS(Method):
     """Gaussians whose colours are fused from a photo's global light, its local light, and their own nature."""
+
+    name: ClassVar[str] = "wildgs"
+    label: ClassVar[str] = "Wild-GS"
+    Config: ClassVar[type] = WildGSConfig
+    memory: ClassVar[MemoryUse] = MemoryUse(per_gaussian=6000, per_pixel=700, fixed=600 * 2**20)
+    config: WildGSConfig
 
     def __init__(
         self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
@@ -49,6 +59,8 @@ class WildGS(Method):
         self.config = config
         self.gaussians = gaussians
         self.sh_degree = config.fusion.sh_degree
+        self.global_size = config.parsing.global_size
+        self.local_size = config.wrapping.local_size
         self.mask_threshold = config.mask_threshold
         self.depth_supervised = not self._lacks("depth")
         self.parsing = Parsing(config.parsing, encoder)
@@ -56,44 +68,61 @@ class WildGS(Method):
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
 
     @classmethod
-    def from_points(
-        cls,
-        config: WildGSConfig,
-        points: Float[Tensor, "P 3"],
-        colors: UInt8[Tensor, "P 3"],
-        encoder: Encoder | None = None,
-        dense: ColoredPoints | None = None,
-        ground: ColoredPoints | None = None,
+    def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
+        """Geometry and f^in."""
+        return GEOMETRY_ROWS | {"intrinsic": (config.fusion.intrinsic_size,)}
+
+    @classmethod
+    def initial(cls, config: WildGSConfig) -> InitialConfig:
+        """Depth points, ground and sky as configured."""
+        return InitialConfig(config.depth_points, config.ground, config.sky)
+
+    @classmethod
+    def create(
+        cls, config: WildGSConfig, initial: InitialGaussians, encoder: Encoder | None = None
     ) -> WildGS:
-        """Starts from SfM points and their colours, in the scene's aligned frame.
+        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points.
 
         Args:
             config: The model's configuration.
-            points: SfM points; the triplane covers the central part of them.
-            colors: Their colours.
+            initial: The first Gaussians.
             encoder: Overrides the encoder that `config` names.
-            dense: Further points with colours, for Gaussians alone (`wildgs.priors.depth_points`).
-            ground: Where the ground goes on (`wildgs.priors.ground`).
         """
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
-        box = robust_box(points, config.wrapping.box_quantile, ratio)
-        sfm_points, sfm_colors = points, colors_to_unit(colors)
-        if dense is not None:
-            points, colors = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
-        parts = [(geometry_from_points(points), colors_to_unit(colors))]
-        if ground is not None:
-            parts.append((ground_rows(ground[0], config.ground.spacing), colors_to_unit(ground[1])))
-        if config.sky.points:
-            sky_colors = torch.full((config.sky.points, 3), SKY_COLOR)
-            parts.append((sky_rows(config.sky, sfm_points), sky_colors))
-        rows = {name: torch.cat([part[name] for part, _ in parts]) for name in parts[0][0]}
-        unit_colors = torch.cat([painted for _, painted in parts])
-        rows["intrinsic"] = torch.zeros(len(unit_colors), config.fusion.intrinsic_size)
-        model = cls(config, Gaussians(rows), box, encoder)
+        box = robust_box(initial.points, config.wrapping.box_quantile, ratio)
+        intrinsic = torch.zeros(len(initial.colors), config.fusion.intrinsic_size)
+        model = cls(config, Gaussians(initial.rows | {"intrinsic": intrinsic}), box, encoder)
         with torch.no_grad():
-            model.gaussians.rows["intrinsic"].copy_(model.fusion.initial_intrinsic(unit_colors))
-        model.wrapping.calibrate(sfm_points, sfm_colors)
+            model.gaussians.rows["intrinsic"].copy_(model.fusion.initial_intrinsic(initial.colors))
+        model.wrapping.calibrate(initial.points, initial.point_colors)
         return model
+
+    @classmethod
+    def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
+        """With a fresh encoder and any box."""
+        return cls(
+            config, gaussians, Box(torch.zeros(3), torch.ones(3)), encoder_of(state, "parsing.encoder.")
+        )
+
+    def row_rates(self) -> dict[str, LearningRate]:
+        """That of f^in."""
+        rates = self.config.learning_rates
+        return {"intrinsic": LearningRate(rates.intrinsic, rates.decay)}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """The networks, and apart from them the encoder."""
+        rates = self.config.learning_rates
+        encoder = list(self.parsing.encoder.parameters())
+        owned = {id(p) for p in (*encoder, *self.gaussians.parameters())}
+        networks = [p for p in self.parameters() if id(p) not in owned]
+        return [
+            ParameterGroup("networks", networks, LearningRate(rates.networks, rates.decay)),
+            ParameterGroup("encoder", encoder, LearningRate(rates.encoder, rates.decay)),
+        ]
+
+    def appearance_parameters(self) -> tuple[str, ...]:
+        """The centres, at which planes are sampled, and the fusion network."""
+        return ("fusion.", "gaussians.rows.means")
 
     def _lacks(self, part: Ablation) -> bool:
         return part in self.config.without
@@ -108,10 +137,14 @@ class WildGS(Method):
         camera: Camera,
         keep: Bool[Tensor, "H W"] | None = None,
         *,
+        name: str | None = None,
         trust_mask: bool = True,
+        explicit: bool = True,
     ) -> Appearance:
         """Parses the photo, lifts its static pixels by the rendered depth, builds the triplane, matches colours."""
         appearance = self.parse(photo)
+        if not explicit:
+            return appearance
         if not trust_mask:
             appearance = replace(appearance, visibility=None)
         with torch.no_grad():
@@ -210,10 +243,6 @@ class WildGS(Method):
         return self.fusion(
             embeddings.global_embedding, embeddings.local_embeddings, intrinsic, embeddings.color_map
         )
-
-    def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """Spherical harmonics under an appearance: sample, embed, fuse."""
-        return self.fuse(self.embed(appearance, rows), rows)
 
     def training_pass(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,6 @@ from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
-from wildgs.model.wildgs import ColoredPoints
-from wildgs.priors.depth_points import depth_points
-from wildgs.priors.ground import ground_points
 from wildgs.runs.scenes import CHECKPOINT_FOLDER, adopt_scene, carried_record, require_same_scene
 from wildgs.scene import Alignment, Scene, load_scene
 from wildgs.scene.carried import SCENE_FILE, Progress, carry_scene, read_carried_scene
@@ -245,12 +242,10 @@ def start_training(
     # The trainer keeps the generators' states; the process gets its own back.
     with team.together(), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.train.seed)
-        points, colors = _within_budget(scene, config)
-        dense = ground = None
-        if config.method == "wildgs":
-            dense = _dense_points(scene, config, len(points))
-            ground = _ground_points(scene, config, (points, colors), dense)
-        method = create_method(config.method, config.model, points, colors, dense, ground)
+        budget = config.train.density.max_gaussians
+        method = create_method(
+            config.method, config.model, scene, max_gaussians=budget, seed=config.train.seed
+        )
         return Trainer(method.to(device), scene, config.train, team)
 
 
@@ -259,44 +254,6 @@ def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Progress | N
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
     carry_scene(folder, scene, progress)
-
-
-def _dense_points(scene: Scene, config: RunConfig, sparse: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points from depth priors."""
-    wanted = config.model.depth_points
-    allowed = min(wanted.points, _half_of_the_room(config, sparse))
-    return depth_points(scene, replace(wanted, points=allowed), config.train.seed)
-
-
-def _ground_points(
-    scene: Scene, config: RunConfig, sparse: ColoredPoints, dense: ColoredPoints
-) -> ColoredPoints:
-    """Where the ground goes on."""
-    points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
-    wanted = config.model.ground
-    allowed = min(wanted.points, _half_of_the_room(config, len(points)))
-    centers = torch.stack([view.camera.position for view in scene.train_views])
-    return ground_points(points, colors, centers, replace(wanted, points=allowed), config.train.seed)
-
-
-def _half_of_the_room(config: RunConfig, taken: int) -> int:
-    """Half of the Gaussians that the budget leaves beside the sky's and `taken`: growth needs the rest."""
-    return max(0, config.train.density.max_gaussians - taken - config.model.sky.points) // 2
-
-
-def _within_budget(scene: Scene, config: RunConfig) -> tuple[torch.Tensor, torch.Tensor]:
-    """The scene's points, or a random choice of them where they are more than the budget."""
-    count, budget = len(scene.points), config.train.density.max_gaussians
-    if count <= budget:
-        return scene.points, scene.point_colors
-    warnings.warn(
-        f"the scene has {count:,} points; training starts from {budget:,} of them (--max-gaussians)",
-        WildGSWarning,
-        stacklevel=3,
-    )
-    generator = torch.Generator().manual_seed(config.train.seed)
-    chosen = torch.randperm(count, generator=generator)[:budget].sort().values
-    return scene.points[chosen], scene.point_colors[chosen]
 
 
 def resume_training(

@@ -17,7 +17,6 @@ from wildgs.geometry.camera import Camera
 from wildgs.light.look import NEUTRAL, Look, look_of
 from wildgs.light.sources import LightSources
 from wildgs.model.method import Method
-from wildgs.model.wildgs import WildGS
 from wildgs.rasterize import Rendering, blend, sh_to_colors
 from wildgs.scene import Scene, View, match_view
 
@@ -54,8 +53,8 @@ class Subject:
 
     @property
     def relightable(self) -> bool:
-        """Whether the method knows more than one light."""
-        return isinstance(self.method, WildGS)
+        """Whether photos have a say in the method's colours."""
+        return self.method.relightable
 
     @property
     def device(self) -> torch.device:
@@ -128,11 +127,13 @@ class TrainingSubject(Subject):
         """As `Subject.look`; without local light as long as training is without it."""
         self._catch_up()
         with self._inference():
-            if self._explicit or not isinstance(self.method, WildGS):
+            if self._explicit or not self.relightable:
                 return super().look(spec, like)
             view = match_view(self.views, str(spec)) or match_view(self.views, like or "") or self.views[0]
             with torch.no_grad():
-                return look_of(self.method, self.method.parse(view.load(self.device)[0]), view.name)
+                photo, camera = view.load(self.device)[0], view.camera.to(self.device)
+                appearance = self.method.encode(photo, camera, name=view.name, explicit=False)
+                return look_of(self.method, appearance, view.name)
 
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
         """As `Subject.visibility`."""

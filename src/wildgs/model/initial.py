@@ -1,0 +1,182 @@
+"""The first Gaussians: on SfM points, on depth priors, on the ground and in the sky, within one budget."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from wildgs.errors import WildGSWarning
+from wildgs.model.config import InitialConfig, SkyConfig
+from wildgs.model.gaussians import colors_to_unit, geometry_from_points
+from wildgs.model.sky import COLOR as SKY_COLOR
+from wildgs.model.sky import sky_points
+from wildgs.priors.depth_points import depth_points
+from wildgs.priors.ground import ground_points
+from wildgs.scene import Scene
+
+ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
+"""Positions in the aligned frame, and 8-bit colours."""
+
+GROUND_WIDTH, GROUND_THICKNESS = 0.6, 0.1
+"""Standard deviations along and across the ground, in units of the spacing: neighbours overlap."""
+GROUND_OPACITY = 0.7
+
+
+@dataclass(frozen=True)
+class InitialGaussians:
+    """What a method is created from.
+
+    Attributes:
+        rows: Geometry of all first Gaussians: means, quats, log_scales, opacity_logits.
+        colors: Their colours, RGB in [0, 1].
+        points: The SfM points among them, in the aligned frame.
+        point_colors: Colours of those, RGB in [0, 1].
+        photos: Names of the training photos.
+    """
+
+    rows: dict[str, Tensor]
+    colors: Float[Tensor, "N 3"]
+    points: Float[Tensor, "P 3"]
+    point_colors: Float[Tensor, "P 3"]
+    photos: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class InitialBudget:
+    """How `max_gaussians` is shared among the first Gaussians.
+
+    The sky takes a sixth at most, and SfM points three quarters of what it leaves. Depth points take at most half
+    of what then remains, and the ground half of what they leave: the rest is for densification.
+    """
+
+    max_gaussians: int
+
+    def sky(self, wanted: int) -> int:
+        """Gaussians of the sky."""
+        return min(wanted, self.max_gaussians // 6)
+
+    def sfm(self, found: int, sky: int) -> int:
+        """Gaussians on SfM points; at least one."""
+        return min(found, max(1, 3 * (self.max_gaussians - sky) // 4))
+
+    def further(self, wanted: int, taken: int) -> int:
+        """Depth points, or the ground's, where `taken` Gaussians are placed already."""
+        return min(wanted, max(0, self.max_gaussians - taken) // 2)
+
+
+def initial_gaussians(
+    scene: Scene, config: InitialConfig, max_gaussians: int, seed: int = 0
+) -> InitialGaussians:
+    """All first Gaussians of a scene.
+
+    Args:
+        scene: Its SfM points, and its training photos with their depth priors.
+        config: What is placed beside the SfM points.
+        max_gaussians: Bound on all of them together; `InitialBudget` says how it is shared.
+        seed: Of random choices.
+    """
+    budget = InitialBudget(max_gaussians)
+    sky = replace(config.sky, points=budget.sky(config.sky.points))
+    sparse = _thinned(scene, budget.sfm(len(scene.points), sky.points), seed)
+    taken = sky.points + len(sparse[0])
+    wanted = replace(config.depth_points, points=budget.further(config.depth_points.points, taken))
+    dense = depth_points(scene, wanted, seed)
+    taken += len(dense[0])
+    wanted_ground = replace(config.ground, points=budget.further(config.ground.points, taken))
+    known, painted = (torch.cat(both) for both in zip(sparse, dense, strict=True))
+    centers = [view.camera.position for view in scene.train_views]
+    nothing = (known[:0], painted[:0])
+    ground = ground_points(known, painted, torch.stack(centers), wanted_ground, seed) if centers else nothing
+    names = [view.name for view in scene.train_views]
+    return initial_from_points(replace(config, sky=sky), *sparse, dense=dense, ground=ground, photos=names)
+
+
+def initial_from_points(
+    config: InitialConfig,
+    points: Float[Tensor, "P 3"],
+    colors: UInt8[Tensor, "P 3"],
+    *,
+    dense: ColoredPoints | None = None,
+    ground: ColoredPoints | None = None,
+    photos: Sequence[str] = (),
+) -> InitialGaussians:
+    """First Gaussians on points that are known already.
+
+    Args:
+        config: Of the sky and the ground's spacing.
+        points: SfM points in the aligned frame.
+        colors: Their colours.
+        dense: Further points, from depth priors.
+        ground: Points that continue the ground.
+        photos: Names of the training photos.
+    """
+    surface, painted = points, colors
+    if dense is not None:
+        surface, painted = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
+    parts = [(geometry_from_points(surface), colors_to_unit(painted))]
+    if ground is not None:
+        parts.append((ground_rows(ground[0], config.ground.spacing), colors_to_unit(ground[1])))
+    if config.sky.points:
+        parts.append((sky_rows(config.sky, points), torch.full((config.sky.points, 3), SKY_COLOR)))
+    return InitialGaussians(
+        rows={name: torch.cat([rows[name] for rows, _ in parts]) for name in parts[0][0]},
+        colors=torch.cat([unit for _, unit in parts]),
+        points=points,
+        point_colors=colors_to_unit(colors),
+        photos=tuple(photos),
+    )
+
+
+def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tensor]:
+    """Geometry of the ground's Gaussians: thin level discs, opaque from the start.
+
+    Args:
+        points: Their centres in the aligned frame, +z up.
+        spacing: Distance between neighbours, world units.
+
+    Returns:
+        Rows as `wildgs.model.gaussians.geometry_from_points` gives them.
+    """
+    count = len(points)
+    scales = spacing * torch.tensor([GROUND_WIDTH, GROUND_WIDTH, GROUND_THICKNESS])
+    return {
+        "means": points.float().clone(),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        "log_scales": scales.log().repeat(count, 1),
+        "opacity_logits": torch.full((count,), GROUND_OPACITY).logit(),
+    }
+
+
+def sky_rows(config: SkyConfig, points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
+    """Geometry of the sky's Gaussians: round, and as wide as their neighbours are far.
+
+    Args:
+        config: The shell.
+        points: The scene's SfM points in the aligned frame, +z up.
+
+    Returns:
+        Rows as `wildgs.model.gaussians.geometry_from_points` gives them.
+    """
+    rows = geometry_from_points(sky_points(config, points))
+    rows["opacity_logits"] = torch.full((config.points,), config.opacity).logit()
+    return rows
+
+
+def _thinned(scene: Scene, allowed: int, seed: int) -> ColoredPoints:
+    """The scene's SfM points, or a random choice of `allowed` where there are more."""
+    count = len(scene.points)
+    if count <= allowed:
+        return scene.points, scene.point_colors
+    warnings.warn(
+        f"the scene has {count:,} points; training starts from {allowed:,} of them (--max-gaussians)",
+        WildGSWarning,
+        stacklevel=4,
+    )
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randperm(count, generator=generator)[:allowed].sort().values
+    return scene.points[chosen], scene.point_colors[chosen]
