@@ -6,6 +6,8 @@ of them shows has no points, and a view that looks there sees through the scene 
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
