@@ -1,7 +1,9 @@
 """Does a training that is killed again and again end in the same bits as one that is left alone?
 
 Trains a tiny landmark once undisturbed, then again with SIGKILL at random moments, part of them inside the writing
-of a checkpoint, going on with --resume after each. Prints a table and compares SHA-256 over all tensors.
+of a checkpoint, and with SIGHUP (a closed terminal), going on with --resume after each. In every second training
+nobody reads what is printed: the pipe is closed after the first line. Prints a table and compares SHA-256 over all
+tensors.
 Methods that are not reproducible from run to run cannot be judged; that is checked first (exit code 3).
 
 Example: python benchmarks/kill_and_resume.py --moments 20
@@ -16,6 +18,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +41,13 @@ STAGES = (
 )
 """Moments inside the writing of a checkpoint."""
 
-PRELOADED = ["wildgs.cli.train", "wildgs.rasterize.cpu.backend", "torch.utils.tensorboard", "transformers"]
+PRELOADED = [
+    "wildgs.cli.train",
+    "wildgs.library.training",
+    "wildgs.rasterize.cpu.backend",
+    "torch.utils.tensorboard",
+    "transformers",
+]
 """Imported once by the server from which trainings are forked: kills are many, and imports slow."""
 
 
@@ -79,16 +88,35 @@ def _kill_inside(stage: str, saves: int) -> None:
     Path.replace = replacing  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _child(arguments: list[str], output: Path, stage: str | None) -> None:
-    """One training: its output goes to a file, and it may kill itself."""
+def _leave_after_first_line(output: Path) -> None:
+    """Puts a pipe in the place of the output, whose reader leaves once training has begun."""
+    reader, writer = os.pipe()
+    os.dup2(writer, 1)
+    os.dup2(writer, 2)
+    os.close(writer)
+
+    def read() -> None:
+        with os.fdopen(reader, "rb") as pipe, output.open("ab") as copy:
+            for line in pipe:
+                copy.write(line)
+                copy.flush()
+                if b"training " in line:
+                    return
+
+    threading.Thread(target=read, daemon=True).start()
+
+
+def _child(arguments: list[str], output: Path, stage: str | None, unread: bool) -> None:
+    """One training: its output goes to a file, or to a pipe that closes; and it may kill itself."""
     handle = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
     sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115 - for the process's life
     sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
-    from wildgs.cli import main, screen
+    from wildgs.cli import main
 
-    screen.console.file = sys.stdout
+    if unread:
+        _leave_after_first_line(output)
     if stage is not None:
         _kill_inside(stage, 2)
     main(arguments)
@@ -102,6 +130,8 @@ class Command:
     """How many kills."""
     writing: float = 0.4
     """Share of the kills that fall inside the writing of a checkpoint."""
+    hangups: float = 0.3
+    """Share of the other kills that are SIGHUP, on which training saves and ends."""
     method: MethodName = "3dgs"
     """What is trained."""
     steps: int = 240
@@ -109,7 +139,7 @@ class Command:
     every: int = 12
     """Steps between checkpoints."""
     seed: int = 0
-    """Of the moments."""
+    """Random seed of the moments."""
 
 
 def main(command: Command) -> int:
@@ -137,7 +167,9 @@ def _run(command: Command, folder: Path) -> int:
         stage = rng.choice(STAGES) if rng.random() < command.writing else None
         # Early enough that the run does not end before the last kill.
         delay = rng.uniform(0, seconds * 2 / command.moments)
-        if _train(command, scene, output, stage, delay) is not None:
+        hangup = stage is None and rng.random() < command.hangups
+        unread = bool(killed % 2)
+        if _train(command, scene, output, stage, delay, hangup=hangup, unread=unread) is not None:
             shutil.rmtree(output)  # it ended before it was killed: another round from its start
             print("     the run ended; once more from the start")
             continue
@@ -145,8 +177,9 @@ def _run(command: Command, folder: Path) -> int:
         checkpoints = list_checkpoints(output / "checkpoints")
         newest = checkpoints[-1].stem if checkpoints else "none yet"
         partial = len(list(output.rglob(".*.part")))
+        name = "SIGHUP, " if hangup else ""
         print(
-            f"{killed:>3}  {stage or f'{delay:.2f} s after the first step':<32}  {newest:<17}  {partial}",
+            f"{killed:>3}  {stage or f'{name}{delay:.2f} s after the start':<32}  {newest:<17}  {partial}",
             flush=True,
         )
     _train(command, scene, output, None, None)
@@ -157,7 +190,14 @@ def _run(command: Command, folder: Path) -> int:
 
 
 def _train(
-    command: Command, scene: Path, output: Path, stage: str | None, delay: float | None
+    command: Command,
+    scene: Path,
+    output: Path,
+    stage: str | None,
+    delay: float | None,
+    *,
+    hangup: bool = False,
+    unread: bool = False,
 ) -> float | None:
     """Trains to the end, or kills; seconds of training, or None where it was killed."""
     arguments = ["train", scene, "--output", output, "--method", command.method, "--steps", command.steps]
@@ -167,16 +207,21 @@ def _train(
         arguments.append("--resume")
     log = output.parent / "output.txt"
     log.write_text("")
-    process = SERVER.Process(target=_child, args=([str(a) for a in arguments], log, stage), daemon=True)
+    process = SERVER.Process(
+        target=_child, args=([str(a) for a in arguments], log, stage, unread), daemon=True
+    )
     process.start()
     while process.is_alive() and "training " not in log.read_text():
         time.sleep(0.05)
     start = time.monotonic()
     if delay is not None and stage is None:
         time.sleep(delay)
-        process.kill()
+        if hangup and process.pid is not None:
+            os.kill(process.pid, signal.SIGHUP)
+        else:
+            process.kill()
     process.join()
-    if process.exitcode == -signal.SIGKILL:
+    if process.exitcode in (-signal.SIGKILL, -signal.SIGHUP, 128 + signal.SIGHUP):
         return None
     if process.exitcode != 0:
         raise SystemExit(f"training failed:\n{log.read_text()}")

@@ -23,16 +23,30 @@ def scene(trained: Path) -> wildgs.LoadedScene:
     return wildgs.load(trained)
 
 
-def test_the_documented_example_runs(trained: Path, tmp_path: Path, monkeypatch) -> None:
+def test_the_documented_examples_run_in_order(
+    trained: Path, landmark: Path, tmp_path: Path, monkeypatch
+) -> None:
     examples = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(examples) == 1
+    assert len(examples) == 5
     monkeypatch.chdir(tmp_path)
-    assert '"runs/gate"' in examples[0]
-    exec(compile(examples[0].replace('"runs/gate"', repr(str(trained))), str(DOCS), "exec"), {})
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        *(f"frame_{number:03d}.png" for number in range(5)),
-        "relit.png",
-    ]
+    monkeypatch.setenv("WILDGS_LPIPS", "off")
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "gate").symlink_to(landmark)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "gate").symlink_to(trained)
+    names: dict[str, object] = {}
+    for example in examples:
+        exec(compile(example, str(DOCS), "exec"), names)
+    assert len(names["losses"]) == 20  # pyright: ignore
+    pictures = {path.name for path in tmp_path.glob("*.png")}
+    assert pictures == {*(f"frame_{number:03d}.png" for number in range(5)), "relit.png", "still.png"}
+    assert {"first.ply", "bench"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_documentation_names_every_function() -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    for name in wildgs._MODULES:
+        assert name in text, name
 
 
 def test_importing_the_package_loads_no_torch() -> None:

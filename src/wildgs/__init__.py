@@ -14,6 +14,7 @@ from wildgs.version import __version__ as __version__
 if TYPE_CHECKING:
     from wildgs.config import ExecutionConfig as ExecutionConfig
     from wildgs.config import RunConfig as RunConfig
+    from wildgs.engine.config import TrainConfig as TrainConfig
     from wildgs.errors import UserError as UserError
     from wildgs.errors import WildGSWarning as WildGSWarning
     from wildgs.library.benchmark import benchmark as benchmark
@@ -33,15 +34,18 @@ if TYPE_CHECKING:
     from wildgs.library.training import train as train
     from wildgs.light.look import Look as Look
     from wildgs.light.look import mix as mix
+    from wildgs.scene.config import DataConfig as DataConfig
     from wildgs.sfm.reconstruction import reconstruct as reconstruct
     from wildgs.viewer.serving import view as view
 
 _MODULES = {
+    "DataConfig": "scene.config",
     "ExecutionConfig": "config",
     "LoadedScene": "library.loaded",
     "Look": "light.look",
     "MixOptions": "library.config",
     "RunConfig": "config",
+    "TrainConfig": "engine.config",
     "TrajectoryOptions": "library.config",
     "UserError": "errors",
     "WildGSWarning": "errors",

@@ -11,8 +11,9 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -29,20 +30,42 @@ _ANNOUNCE_AFTER = 1.0
 _announced = threading.Event()
 
 
+_limit: list[int] = []
+"""Numbers of threads that `limited` asks for, the innermost last."""
+
+
+@contextmanager
+def limited(count: int | None) -> Iterator[None]:
+    """Runs kernels and torch on so many threads while the block runs; None changes nothing."""
+    if count is None:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    _limit.append(count)
+    try:
+        yield
+    finally:
+        _limit.remove(count)
+        torch.set_num_threads(before)
+
+
 def thread_count() -> int:
-    """How many threads kernels run on: `WILDGS_NUM_THREADS`, else what torch uses.
+    """How many threads kernels run on: those of `limited`, `WILDGS_NUM_THREADS`, or what torch uses.
 
     Raises:
         UserError: `WILDGS_NUM_THREADS` is not a positive whole number.
     """
-    wish = os.environ.get("WILDGS_NUM_THREADS")
-    if wish is None:
+    if _limit:
+        return _limit[-1]
+    value = os.environ.get("WILDGS_NUM_THREADS")
+    if value is None:
         return torch.get_num_threads()
-    if not wish.isdecimal() or int(wish) == 0:
+    if not value.isdecimal() or int(value) == 0:
         raise UserError(
-            f"WILDGS_NUM_THREADS={wish!r} is not a positive whole number; set it to a count of threads"
+            f"WILDGS_NUM_THREADS={value!r} is not a positive whole number; set it to a count of threads"
         )
-    return int(wish)
+    return int(value)
 
 
 @cache

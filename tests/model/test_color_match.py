@@ -7,7 +7,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.model.color_match import LEAST_PIXELS, match_colors
+from wildgs.geometry.spherical_harmonics import C0
+from wildgs.model.color_match import (
+    LEAST_PIXELS,
+    SKY_COLUMNS,
+    elevation_powers,
+    mapped,
+    match_colors,
+    match_sky,
+)
 
 
 def changed(colors: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
@@ -55,3 +63,25 @@ def test_too_few_pixels_and_no_numbers_change_nothing() -> None:
     weights.view(-1)[: LEAST_PIXELS - 1] = 1
     assert not match_colors(render, photo, weights).any()
     assert not match_colors(torch.full_like(render, torch.nan), photo, torch.ones(20, 20)).any()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_skys_map_may_vary_with_the_elevation(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    render = torch.rand(24, 30, 3, generator=generator)
+    sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
+    change = 0.2 * (torch.rand(3, SKY_COLUMNS, generator=generator) - 0.5)
+    photo = changed(render, change[:, :4]) + elevation_powers(sine) @ change[:, 4:].T
+    found = match_sky(render, photo, torch.ones(24, 30), sine)
+    matched = changed(render, found[:, :4]) + elevation_powers(sine) @ found[:, 4:].T
+    torch.testing.assert_close(matched, photo, atol=0.01, rtol=0)
+
+
+def test_mapped_harmonics_are_those_of_mapped_colours() -> None:
+    harmonics, change = torch.randn(50, 4, 3), 0.3 * torch.randn(3, 4)
+    basis, offset = torch.randn(4), 0.1 * torch.randn(50, 3)
+    basis[0] = C0
+    colors = torch.einsum("k, vkc -> vc", basis, harmonics) + 0.5
+    found = torch.einsum("k, vkc -> vc", basis, mapped(harmonics, change, offset)) + 0.5
+    torch.testing.assert_close(found, changed(colors, change) + offset)

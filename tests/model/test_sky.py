@@ -1,16 +1,20 @@
 import math
 
+import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.initial import sky_rows
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.sky import SkyConfig, shell_directions
 from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.model.wrapping import WrappingConfig
 
 
+@settings(deadline=None)
 @given(count=st.integers(8, 400), lowest=st.floats(-90, 60))
 def test_directions_are_units_above_the_lowest_elevation(count: int, lowest: float) -> None:
     directions = shell_directions(count, lowest)
@@ -53,3 +57,46 @@ def test_models_start_with_a_sky_unless_told_otherwise() -> None:
     )
     assert (len(with_sky.gaussians), len(bare.gaussians)) == (80, 30)
     torch.testing.assert_close(with_sky.wrapping.low, bare.wrapping.low)
+
+
+GREY, BLUE, PINK = torch.full((3,), 0.45), torch.tensor([0.1, 0.3, 0.9]), torch.tensor([0.9, 0.6, 0.5])
+
+
+@pytest.fixture
+def tower() -> tuple[WildGS, Camera]:
+    """A grey tower before a sky, and a camera that sees half of each."""
+    torch.manual_seed(0)
+    x, z = torch.meshgrid(torch.linspace(-0.5, 0.5, 30), torch.linspace(-1, 1, 60), indexing="ij")
+    points = torch.stack([x, torch.full_like(x, 1.0), z], dim=-1).reshape(-1, 3)
+    config = WildGSConfig(
+        parsing=ParsingConfig(max_side=64),
+        wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8), crop_ratio=1.0),
+        sky=SkyConfig(points=3000),
+    )
+    model = WildGS.from_points(config, points, torch.full((1800, 3), 128, dtype=torch.uint8))
+    with torch.no_grad():
+        model.gaussians.rows["opacity_logits"].fill_(4.0)
+    viewmat = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 1.0], [0, 0, 0, 1.0]])
+    K = torch.tensor([[60.0, 0, 30.0], [0, 60.0, 20.0], [0, 0, 1.0]])
+    return model, Camera(viewmat, K, 60, 40)
+
+
+def photo_before(camera: Camera, landmark: torch.Tensor, sky: torch.Tensor) -> torch.Tensor:
+    photo = sky.expand(camera.height, camera.width, 3).clone()
+    photo[:, 15:45] = landmark + 0.05 * torch.rand(40, 30, 1, generator=torch.Generator().manual_seed(0))
+    return photo
+
+
+def test_the_landmark_keeps_its_colour_under_any_sky(tower: tuple[WildGS, Camera]) -> None:
+    """The match of the landmark reads its own pixels; that of the sky reads the sky's."""
+    model, camera = tower
+    renders = []
+    with torch.no_grad():
+        for sky in (BLUE, PINK):
+            photo = photo_before(camera, GREY, sky)
+            renders.append(model.render(camera, model.shade(model.encode(photo, camera))))
+            torch.testing.assert_close(renders[-1].colors[:, :12], photo[:, :12], atol=0.05, rtol=0)
+    first, second = renders
+    torch.testing.assert_close(first.colors[5:35, 20:40], second.colors[5:35, 20:40], atol=0.04, rtol=0)
+    assert torch.equal(first.depth, second.depth)
+    assert torch.equal(first.alpha, second.alpha)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import inspect
 import io
 import logging
 import os
@@ -89,11 +90,11 @@ def _run(verb: str, arguments: list[str]) -> None:
     module = importlib.import_module(f"wildgs.cli.{verb}")
     # A preset, or the run to resume, among the arguments sets the defaults of the other options.
     kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
-    description = module.Command.__doc__
+    description = inspect.cleandoc(module.Command.__doc__)
     if HELP_ALL in arguments:
         tyro.cli(kind, prog=f"wildgs {verb}", args=["--help"], description=description)
     if any(option in arguments for option in HELP):
-        _help(verb, module, kind)
+        _help(verb, module, kind, description)
     command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=description)
     from wildgs.cli.screen import Lines
 
@@ -112,7 +113,7 @@ def _run(verb: str, arguments: list[str]) -> None:
         logger.setLevel(level)
 
 
-def _help(verb: str, module: ModuleType, kind: type) -> None:
+def _help(verb: str, module: ModuleType, kind: type, description: str) -> None:
     """Prints the options that matter, and where the others are; ends the process."""
     import tyro
 
@@ -121,7 +122,7 @@ def _help(verb: str, module: ModuleType, kind: type) -> None:
     shown = getattr(module, "SHOWN", None)
     brief = kind if shown is None else with_only(kind, shown)
     try:
-        tyro.cli(brief, prog=f"wildgs {verb}", args=["--help"], description=module.Command.__doc__)
+        tyro.cli(brief, prog=f"wildgs {verb}", args=["--help"], description=description)
     finally:
         if shown is not None:
             print(

@@ -16,7 +16,7 @@ from wildgs.priors.config import DEPTH_ANYTHING
 class Command:
     """Estimates the disparity of every photo of a scene and writes it to SCENE/depth/ as 16-bit pictures.
 
-    Training then uses it as its depth prior. Photos that already have a picture there are passed over.
+    Training then uses it as its depth prior. Photos that already have an estimate are skipped.
 
     Example: wildgs depth scenes/gate
     """

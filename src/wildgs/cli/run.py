@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
-from wildgs.cli.options import UNNAMED
 from wildgs.cli.screen import print_finished, progress_shown
 from wildgs.config import ExecutionConfig
+from wildgs.scene.config import IMAGE_CACHE
 from wildgs.sfm.config import SfmConfig
 
-SHOWN = ("steps", "downscale", "max_gaussians", "holdout", "execution.image_cache")
+SHOWN = ("steps", "downscale", "max_gaussians", "holdout", "image_cache")
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,16 @@ class Command:
     holdout: int = 8
     """Every n-th photo is held out for scoring; 0 = none."""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
-    execution: Annotated[ExecutionConfig, UNNAMED] = field(default_factory=ExecutionConfig)
+    image_cache: str = IMAGE_CACHE
+    """Memory for decoded photos; photos beyond it are decoded again when their turn comes."""
 
 
 def run(command: Command) -> None:
     """Runs every stage; a stage that is done already is not done again."""
     import wildgs
 
+    threads = command.sfm.threads if command.sfm.threads > 0 else None
+    execution = ExecutionConfig(image_cache=command.image_cache, threads=threads)
     with progress_shown() as screen:
         finished = wildgs.run(
             command.photos,
@@ -55,7 +57,7 @@ def run(command: Command) -> None:
             max_gaussians=command.max_gaussians,
             holdout=command.holdout,
             sfm=command.sfm,
-            execution=command.execution,
+            execution=execution,
             progress=screen,
             observers=[screen.step],
         )

@@ -49,7 +49,9 @@ class Forgiving:
 
     @property
     def _stream(self) -> Any:
-        return getattr(sys, self._name)
+        stream = getattr(sys, self._name)
+        # While a bar is shown, rich stands in for both streams, and writes to the console, which writes here.
+        return getattr(stream, "rich_proxied_file", stream) if self._name == "stdout" else stream
 
     def write(self, text: str) -> int:
         """Writes, if it can."""
@@ -81,6 +83,8 @@ class Forgiving:
             return False
 
     def __getattr__(self, name: str) -> Any:
+        if name == "rich_proxied_file":  # or rich would write past this class
+            raise AttributeError(name)
         return getattr(self._stream, name)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 from contextlib import ExitStack
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,11 +13,11 @@ import tyro
 
 from wildgs.cli.options import UNNAMED, option_name
 from wildgs.cli.screen import console, progress_shown
-from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config, with_entries
+from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, config_type
-from wildgs.presets import PRESET_NAMES, PRESETS, PresetName, with_preset
+from wildgs.presets import PRESET_NAMES, PresetName, with_preset
 from wildgs.scene.config import DataConfig
 from wildgs.viewer.config import ServerConfig
 
@@ -92,7 +92,9 @@ def command_for(arguments: list[str]) -> type[Command]:
             config = read_config(found.output / CONFIG_FILE)
             fields.append(("scene", tyro.conf.Positional[Path], field(default=config.scene)))
         # The stored number of steps has been through the preset already.
-        config = with_entries(config, PRESETS[found.preset].entries, f"preset {found.preset}")
+        steps = config.train.steps
+        config = with_preset(config, found.preset)
+        config = replace(config, train=replace(config.train, steps=steps))
     else:
         config = with_preset(config, found.preset)
     parts: list[tuple[str, Any]] = [
@@ -112,6 +114,10 @@ def run(command: Command) -> None:
     import wildgs
     from wildgs.engine.distributed import join
 
+    if command.resume:
+        stored = read_config(command.output / CONFIG_FILE)
+        if stored.method != command.method:
+            raise UserError(f"{command.output} is a run of {stored.method}; leave --method out to resume it")
     config = RunConfig(command.scene.resolve(), command.method, command.data, command.model, command.train)
     if command.resume:
         _refuse_changes(command, config)
@@ -151,7 +157,7 @@ def _refuse_changes(command: Command, config: RunConfig) -> None:
         )
         raise UserError(
             f"--resume continues {command.output} with its own configuration and cannot change {changes}; leave "
-            "these options out, or train anew into another --output"
+            "these options out, or start a new run in another --output"
         )
 
 

@@ -101,9 +101,9 @@ class TrainConfig:
     """Training.
 
     Attributes:
-        steps: How long (paper: 30,000; '†': 15,000). A step is a photo: K processes take K at once.
+        steps: Training steps (paper: 30,000; '†': 15,000). A step is one photo: K processes take K steps at once.
         seed: Random seed.
-        precision: Of the networks; 'auto' takes bfloat16 where the hardware is fast at it.
+        precision: Precision of the networks; 'auto' is bfloat16 where the hardware is fast at it.
         objective: Loss weights.
         schedule: Training schedule.
         optimizer: Learning rates.

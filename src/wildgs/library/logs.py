@@ -34,7 +34,7 @@ def run_log(folder: Path) -> Iterator[None]:
         logger.error("stopped: %s", error)
         raise
     except KeyboardInterrupt as error:
-        logger.info("%s", error or "interrupted")
+        logger.debug("%s", error or "interrupted")  # the caller reports it
         raise
     except Exception:
         logger.exception("training failed")

@@ -37,6 +37,7 @@ from wildgs.runs import (
 )
 from wildgs.scene import Scene, load_scene
 from wildgs.scene.config import parse_bytes
+from wildgs.threads import limited
 
 LEAST_SECONDS_ON_CUDA = 60.0
 """Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
@@ -122,7 +123,7 @@ def train(
     """
     folder, execution, team = Path(output), execution or ExecutionConfig(), team or Team()
     progress = progress or silent
-    with ExitStack() as stack:
+    with limited(execution.threads), ExitStack() as stack:
         if not locked:
             team.from_first(lambda: stack.enter_context(lock_run(folder)))
         if resume == "auto":

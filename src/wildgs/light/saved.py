@@ -15,6 +15,7 @@ from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
+from wildgs.model.color_match import SKY_COLUMNS
 from wildgs.model.method import Method
 
 SUFFIX = ".safetensors"
@@ -101,7 +102,7 @@ def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
     if common.shape != (method.global_size,):
         raise ValueError("embeddings of another length")
-    if color_map.shape != (3, 4):
+    if color_map.shape not in ((3, 4), (3, 4 + SKY_COLUMNS)):
         raise ValueError("a colour map of another shape")
     local = _local_embeddings(method, tensors) if method.local_size else None
     if not all(bool(values.isfinite().all()) for values in (common, color_map, local) if values is not None):

@@ -24,7 +24,7 @@ class Appearance:
     global_embedding: Float[Tensor, " G"] | None = None
     planes: Float[Tensor, "3 C R R"] | None = None
     visibility: Float[Tensor, "H W"] | None = None
-    color_map: Float[Tensor, "3 4"] | None = None
+    color_map: Float[Tensor, "3 M"] | None = None
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,13 @@ class Embeddings:
     Attributes:
         global_embedding: Emb^g; empty for a method that is not relightable.
         local_embeddings: Emb^l per Gaussian; None for a method without local appearance.
-        color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none.
+        color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none. Where the sky is
+            matched apart, its own change follows (`wildgs.model.color_match.match_sky`).
     """
 
     global_embedding: Float[Tensor, " G"]
     local_embeddings: Float[Tensor, "N L"] | None = None
-    color_map: Float[Tensor, "3 4"] | None = None
+    color_map: Float[Tensor, "3 M"] | None = None
 
 
 def blend_embeddings(
@@ -80,7 +81,7 @@ def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
     return Embeddings(torch.stack(total_global).mean(dim=0), local_mean, color_map)
 
 
-def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 4"] | None:
+def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 M"] | None:
     """Σ w [A | b], where a part without a map changes nothing."""
     present = [part.color_map for part in parts if part.color_map is not None]
     if not present:

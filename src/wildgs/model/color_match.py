@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+
 ROUNDS = 6
 RIDGE = 3e-4
 """Of the least squares, in units of mean squared colour: what a photo does not tell stays as it was."""
@@ -18,6 +20,35 @@ OUTLIER = 0.05
 """Residual at which a pixel counts half (Cauchy's weights): passers-by that the mask has missed."""
 LEAST_PIXELS = 64
 """Fewer say nothing about a photo's light."""
+
+
+ELEVATION_ORDERS = 2
+"""Powers of the sine of the elevation by which the sky's colours are matched: it is paler near the horizon."""
+SKY_COLUMNS = 4 + ELEVATION_ORDERS
+"""Columns of the sky's change: [A | b] and one for each power."""
+
+
+def elevation_powers(sine: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch E"]:
+    """What the sky's change multiplies its further columns with."""
+    return torch.stack([sine ** (order + 1) for order in range(ELEVATION_ORDERS)], dim=-1)
+
+
+def mapped(
+    harmonics: Float[Tensor, "V K 3"],
+    change: Float[Tensor, "3 4"],
+    offset: Float[Tensor, "V 3"] | float = 0.0,
+) -> Float[Tensor, "V K 3"]:
+    """Spherical harmonics of colours ``c + A c + b + offset``, by the harmonics of c.
+
+    Args:
+        harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
+        change: [A | b].
+        offset: Of every Gaussian's colour.
+    """
+    matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:, :3]
+    flat = rgb_to_sh0(matrix @ torch.full_like(change[:, 3], 0.5) + change[:, 3] + offset)
+    turned = harmonics @ matrix.T
+    return torch.cat([turned[:, :1] + flat.reshape(-1, 1, 3), turned[:, 1:]], dim=1)
 
 
 @torch.no_grad()
@@ -34,20 +65,48 @@ def match_colors(
     Returns:
         Change [A | b]: colours c become ``c + A c + b``. Zero where too little of the scene is seen.
     """
-    nothing = torch.zeros(3, 4, device=render.device)
+    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None])
+
+
+@torch.no_grad()
+def match_sky(
+    render: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"],
+    weights: Float[Tensor, "H W"],
+    sine: Float[Tensor, "H W"],
+) -> Float[Tensor, "3 M"]:
+    """As `match_colors`, for the sky: the change may vary smoothly with the elevation.
+
+    Args:
+        render: In 0..1, more where the scene is brighter than white.
+        photo: In 0..1.
+        weights: Of the pixels; 0 where there is no sky.
+        sine: Of the elevation at which a pixel shows the sky.
+
+    Returns:
+        Change [A | b | E]: colours c become ``c + A c + b + E @ elevation_powers(sine)``.
+    """
+    further = torch.cat([torch.ones_like(sine)[..., None], elevation_powers(sine)], dim=-1)
+    return _fitted(render, photo, weights, further)
+
+
+def _fitted(render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"]) -> Tensor:
+    """Robust least squares of the photo's difference from the render by the render's colours and further terms."""
+    columns = 3 + further.shape[-1]
+    nothing = torch.zeros(3, columns, device=render.device)
     chosen = weights > 0
     if int(chosen.sum()) < LEAST_PIXELS:
         return nothing
     colors = render[chosen].clamp(0, 1).double()
     residual = photo[chosen].double() - colors
-    padded = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
+    terms = torch.cat([colors, further[chosen].double()], dim=1)
     base = weights[chosen].double()
-    ridge = RIDGE * torch.eye(4, dtype=padded.dtype, device=padded.device)
-    change = torch.zeros(4, 3, dtype=padded.dtype, device=padded.device)
+    ridge = RIDGE * torch.eye(columns, dtype=terms.dtype, device=terms.device)
+    change = torch.zeros(columns, 3, dtype=terms.dtype, device=terms.device)
     trusted = base
     for _ in range(ROUNDS):
-        weighted = padded * (trusted / trusted.sum())[:, None]
-        change = torch.linalg.solve(weighted.T @ padded + ridge, weighted.T @ residual)
-        error = (residual - padded @ change).abs().mean(dim=1)
+        weighted = terms * (trusted / trusted.sum())[:, None]
+        change = torch.linalg.solve(weighted.T @ terms + ridge, weighted.T @ residual)
+        error = (residual - terms @ change).abs().mean(dim=1)
         trusted = base * OUTLIER**2 / (OUTLIER**2 + error.square())
     return change.T.float().contiguous() if change.isfinite().all() else nothing

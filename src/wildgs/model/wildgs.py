@@ -12,13 +12,13 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import match_colors
+from wildgs.model.color_match import elevation_powers, mapped, match_colors, match_sky
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.lifting import lift, liftable, random_part
+from wildgs.model.lifting import MIN_ALPHA, lift, liftable, random_part
 from wildgs.model.method import (
     GEOMETRY_ROWS,
     MemoryUse,
@@ -164,14 +164,39 @@ class WildGS(Method):
         projection: Projection,
         keep: Bool[Tensor, "H W"] | None,
     ) -> Appearance:
-        """Adds what the appearance's own render of the photo is off by."""
+        """Adds what the appearance's own render of the photo is off by, for the landmark and the sky apart.
+
+        Photos are full of sky: one change for all would do to the landmark what the sky needs.
+        """
         colors = paint_visible(self, projection, appearance, self.sh_degree)
         rendering = blend(projection, colors)
         static = liftable(appearance.visibility, rendering.alpha, self.mask_threshold)
         if keep is not None:
             static = static & keep
         weights = static.float() if appearance.visibility is None else appearance.visibility * static
-        return replace(appearance, color_map=match_colors(rendering.colors, photo, weights))
+        if not self.config.sky.points:
+            return replace(appearance, color_map=match_colors(rendering.colors, photo, weights))
+        sky = rendering.depth > self._sky_distance
+        covered = (rendering.alpha > MIN_ALPHA) & sky
+        if keep is not None:
+            covered = covered & keep
+        _, sine = self._seen_from_centre(projection.camera.unproject(rendering.depth))
+        own = match_colors(rendering.colors, photo, weights * ~sky)
+        of_sky = match_sky(rendering.colors, photo, covered.float(), sine)
+        return replace(appearance, color_map=torch.cat([own, of_sky], dim=1))
+
+    @property
+    def _sky_distance(self) -> float:
+        """Half of the shell's radius: what is further away, as a Gaussian or a rendered depth, counts as sky."""
+        return 0.5 * self.config.sky.radius
+
+    def _seen_from_centre(
+        self, points: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Distances of points from the centre of the triplane, and sines of their elevations."""
+        offsets = points - (self.wrapping.low + self.wrapping.high) / 2
+        distances = offsets.norm(dim=-1)
+        return distances, offsets[..., 2] / distances.clamp_min(1e-6)
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
         """M, by 2D Parsing alone."""
@@ -240,9 +265,19 @@ class WildGS(Method):
             intrinsic = take_rows(intrinsic, rows)
         if self._lacks("intrinsic"):
             intrinsic = torch.zeros_like(intrinsic)
-        return self.fusion(
-            embeddings.global_embedding, embeddings.local_embeddings, intrinsic, embeddings.color_map
+        common, local, change = (
+            embeddings.global_embedding,
+            embeddings.local_embeddings,
+            embeddings.color_map,
         )
+        if change is None or change.shape[1] == 4:
+            return self.fusion(common, local, intrinsic, change)
+        harmonics = self.fusion(common, local, intrinsic)
+        own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+        means = self.gaussians.means.detach()
+        distance, sine = self._seen_from_centre(means if rows is None else means[rows])
+        sky = mapped(harmonics, of_sky, elevation_powers(sine) @ by_elevation.T)
+        return torch.where((distance > self._sky_distance)[:, None, None], sky, mapped(harmonics, own))
 
     def training_pass(
         self,

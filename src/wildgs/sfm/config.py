@@ -36,4 +36,4 @@ class SfmConfig:
     threads: int = -1
     """CPU threads; -1 = all."""
     seed: int = 0
-    """Of the random choices of matching and mapping."""
+    """Random seed of matching and mapping."""

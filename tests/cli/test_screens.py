@@ -1,0 +1,100 @@
+"""Screens that go away: nothing that only shows progress ends a training, and a closed terminal saves it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from wildgs.cli import screen
+from wildgs.engine.checkpoint import list_checkpoints
+from wildgs.runs import load_run
+
+SOURCE = Path(__file__).parents[2] / "src"
+TRAIN = ("--method", "3dgs", "--steps", "30", "--checkpoint-every", "1000")
+
+
+def start(landmark: Path, run: Path, *options: object, **streams: object) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "wildgs", "train", landmark, "--output", run, *TRAIN, *options]
+    environment = os.environ | {"PYTHONPATH": str(SOURCE), "WILDGS_NUM_THREADS": "1"}
+    return subprocess.Popen([str(part) for part in command], env=environment, **streams)  # pyright: ignore
+
+
+def trained_steps(run: Path) -> int:
+    return load_run(run).step
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_output_on_a_full_disk(landmark: Path, tmp_path: Path) -> None:
+    with Path("/dev/full").open("wb") as full:
+        process = start(landmark, tmp_path / "run", stdout=full, stderr=full)
+        assert process.wait() == 0
+    assert trained_steps(tmp_path / "run") == 30
+
+
+def test_a_reader_that_leaves(landmark: Path, tmp_path: Path) -> None:
+    process = start(landmark, tmp_path / "run", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    process.stderr.close()
+    assert process.wait() == 0
+    assert trained_steps(tmp_path / "run") == 30
+
+
+def test_a_closed_terminal_saves(landmark: Path, tmp_path: Path) -> None:
+    run, steps = tmp_path / "run", 100_000
+    ours, theirs = os.openpty()
+    process = start(
+        landmark, run, "--steps", steps, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
+    )
+    os.close(theirs)
+    while not (run / "metrics.jsonl").is_file() or not (run / "metrics.jsonl").stat().st_size:
+        assert process.poll() is None
+        os.read(ours, 10_000)
+        time.sleep(0.02)
+    os.close(ours)  # the terminal is gone: writing to it fails from now on
+    process.send_signal(signal.SIGHUP)
+    assert process.wait() == 128 + signal.SIGHUP
+    assert list_checkpoints(run / "checkpoints")
+    assert 0 < trained_steps(run) < steps
+
+
+def test_nohup_is_respected(landmark: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    process = start(
+        landmark,
+        run,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+    )
+    while process.poll() is None and not (run / "config.yaml").is_file():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGHUP)
+    assert process.wait() == 0
+    assert trained_steps(run) == 30
+
+
+def test_names_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    screen.console.print("w[/b]/x.html :smile: [red]v2")
+    with screen.progress_shown() as show:
+        show("reading [b]photos[/b]", 2, 2)
+    screen.print_scores({"evil [v2]": {}})
+    printed = capsys.readouterr().out
+    assert "w[/b]/x.html :smile: [red]v2" in printed
+    assert "reading [b]photos[/b]: 2 done" in printed
+
+
+def test_a_name_that_is_not_utf8_is_printed_with_escapes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with (tmp_path / "out").open("w", encoding="utf-8") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        screen.console.print(os.fsdecode(b"caf\xe9.jpg"))
+    assert (tmp_path / "out").read_text() == "caf\\udce9.jpg\n"

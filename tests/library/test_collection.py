@@ -1,0 +1,76 @@
+"""Photos that are others than those that the poses were made from."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import wildgs
+from wildgs.errors import UserError
+from wildgs.library.collection import compare_collection, record_collection
+from wildgs.runs import lock_run
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """Three photos."""
+    folder = tmp_path / "photos"
+    (folder / "more").mkdir(parents=True)
+    for number, name in enumerate(("a.jpg", "b.png", "more/c.jpg")):
+        pixels = np.full((8, 8, 3), 40 * number, dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / name)
+    return folder
+
+
+@pytest.fixture
+def scene(photos: Path, tmp_path: Path) -> Path:
+    """Stands for a scene that was made from them."""
+    folder = tmp_path / "run" / "scene"
+    (folder / "sparse" / "0").mkdir(parents=True)
+    record_collection(photos, folder)
+    return folder
+
+
+def test_the_same_photos_copied_elsewhere_are_the_same(photos: Path, scene: Path, tmp_path: Path) -> None:
+    assert not compare_collection(photos, scene)
+    copied = photos.rename(tmp_path / "elsewhere")
+    os.utime(copied / "a.jpg", (1, 1))
+    assert not compare_collection(copied, scene)
+
+
+def test_every_difference_is_named(photos: Path, scene: Path) -> None:
+    (photos / "b.png").unlink()
+    Image.new("RGB", (8, 8), "red").save(photos / "new.jpg")
+    content = bytearray((photos / "a.jpg").read_bytes())
+    content[-3] ^= 1
+    (photos / "a.jpg").write_bytes(content)
+    os.utime(photos / "a.jpg", (1, 1))
+    changes = compare_collection(photos, scene)
+    assert (changes.added, changes.removed, changes.changed) == (("new.jpg",), ("b.png",), ("a.jpg",))
+    with pytest.raises(UserError, match=r"1 added \(new\.jpg\), 1 missing \(b\.png\), 1 changed \(a\.jpg\)"):
+        wildgs.run(photos, scene.parent)
+
+
+def test_a_scene_without_a_record_is_compared_by_names(photos: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "old"
+    (scene / "images").mkdir(parents=True)
+    for name in ("a.jpg", "b.jpg"):  # as structure from motion calls them
+        Image.new("RGB", (8, 8)).save(scene / "images" / name)
+    assert not compare_collection(photos, scene)
+    Image.new("RGB", (8, 8)).save(scene / "images" / "other.jpg")
+    assert compare_collection(photos, scene).removed == ("other.jpg",)
+
+
+def test_a_folder_that_does_not_exist_is_refused_whatever_is_there(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="nowhere: no such folder"):
+        wildgs.run(tmp_path / "nowhere", scene.parent)
+
+
+def test_a_second_run_on_one_output_is_refused_at_once(photos: Path, tmp_path: Path) -> None:
+    with lock_run(tmp_path / "run"), pytest.raises(UserError, match="in use"):
+        wildgs.run(photos, tmp_path / "run")
+    assert not (tmp_path / "run" / "scene").exists()
