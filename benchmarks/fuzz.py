@@ -286,7 +286,93 @@ def _read_cameras(folder: Path) -> object:
     return read_camera_path(folder / "ours.json"), read_camera_path(folder / "theirs.json")
 
 
+def _read_exif(folder: Path) -> object:
+    """As `wildgs sfm`, the viewer's uploads and `load_scene` read photos."""
+    from wildgs.scene.images import read_photo
+    from wildgs.sfm.upright import copy_upright
+
+    _tolerate(lambda: read_photo(folder / "photo.jpg", max_pixels=10_000_000))
+    (folder / "p").mkdir(exist_ok=True)
+    shutil.copyfile(folder / "photo.jpg", folder / "p" / "photo.jpg")
+    return copy_upright(folder / "p", folder / "copies", folder / "masks", max_pixels=10_000_000)
+
+
+def _names(folder: Path) -> list[str]:
+    (folder / "names").write_bytes("a.jpg\nü b.png\n2023-07-14 18:22:31.jpg\nsub/c.heic\nphoto".encode())
+    return ["names"]
+
+
+def _read_names(folder: Path) -> object:
+    """Names that a disk may hold become names that a model can hold."""
+    import os
+
+    from wildgs.files import printable
+    from wildgs.sfm.upright import scene_names
+
+    lines = (folder / "names").read_bytes().replace(b"\0", b"").split(b"\n")
+    paths = [Path(os.fsdecode(line[:4000])) for line in lines]
+    names = [
+        path.as_posix() for path in paths if path.name and not path.is_absolute() and ".." not in path.parts
+    ]
+    for name in names:
+        printable(name).encode()
+    safe = scene_names(names)
+    assert len(set(safe)) == len(names)
+    for name in safe:
+        assert max(len(part.encode()) for part in name.split("/")) <= 255
+    return safe
+
+
+def _messages(folder: Path) -> list[str]:
+    import msgspec
+
+    camera = {"wxyz": [1, 0, 0, 0], "position": [0.5, 1, 2], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
+    camera |= {"fov": 0.8, "near": 0.01, "far": 1000, "image_height": 700, "image_width": 1000}
+    part = {"source_component_uuid": "button", "transfer_uuid": "t"}
+    start = part | {"filename": "a.png", "mime_type": "image/png", "part_count": 2, "size_bytes": 8}
+    messages = {
+        "camera": {"type": "ViewerCameraMessage", **camera},
+        "update": {"type": "GuiUpdateMessage", "uuid": "slider", "updates": {"value": 0.5}},
+        "start": {"type": "FileTransferStartUpload", **start},
+        "part": {"type": "FileTransferPart", **part, "part_index": 0, "content": b"abcd"},
+    }
+    for name, message in messages.items():
+        (folder / name).write_bytes(msgspec.msgpack.encode(message))
+    return list(messages)
+
+
+class _Silent:
+    """Replies to uploads that nobody hears."""
+
+    def progress(self, connection: object, upload: object, received: int) -> None:
+        pass
+
+    def failed(self, connection: object, upload: object, reason: str) -> None:
+        pass
+
+
+def _read_messages(folder: Path) -> object:
+    from wildgs.viewer.messages import MalformedMessageError, decode, is_acceptable
+    from wildgs.viewer.uploads import Uploads
+
+    uploads = Uploads(_Silent())
+    uploads.receive("button", lambda name, content: None)
+    with contextlib.suppress(MalformedMessageError):
+        for name in ("camera", "update", "start", "part"):
+            message = decode((folder / name).read_bytes())
+            if message["type"] == "FileTransferStartUpload":
+                uploads.start("browser", message)
+            elif message["type"] == "FileTransferPart":
+                uploads.part("browser", message)
+            else:
+                is_acceptable(message, {}.get)
+    uploads.close()
+
+
 READERS = {
+    "EXIF": Reader(_exif, _read_exif),
+    "names": Reader(_names, _read_names),
+    "viewer messages": Reader(_messages, _read_messages),
     "COLMAP binary": Reader(_scene("bin"), _read_scene),
     "COLMAP text": Reader(_scene("txt"), _read_scene),
     "pictures": Reader(_pictures, _read_pictures),

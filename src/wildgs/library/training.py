@@ -36,6 +36,7 @@ from wildgs.runs import (
     save_run,
 )
 from wildgs.scene import Scene, load_scene
+from wildgs.scene.carried import describe_carried
 from wildgs.scene.config import parse_bytes
 from wildgs.threads import limited
 
@@ -249,6 +250,8 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             team=job.team,
             progress=counter(job.progress, "copying photos to the run"),
         )
+        if job.team.first and not resume:
+            logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
         trainer.feature_cache = parse_bytes(job.execution.feature_cache)
         with ExitStack() as stack:
