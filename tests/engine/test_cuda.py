@@ -30,10 +30,13 @@ def trainer_on(
     model: WildGSConfig,
     method: MethodName = "wildgs",
     config: TrainConfig = CONFIG,
+    *,
+    cuda_graphs: bool = True,
 ) -> Trainer:
     torch.manual_seed(0)
     made = create_method(method, model if method == "wildgs" else None, scene)
     trainer = Trainer(made.to(device), scene, config)
+    trainer.cuda_graphs = cuda_graphs
     trainer.begin()
     return trainer
 
@@ -58,8 +61,7 @@ def test_graphs_change_nothing_but_speed(wall_scene: Scene, tiny_model: WildGSCo
     found = {}
     for graphs in (False, True):
         config = replace(CONFIG, precision="bfloat16")
-        trainer = trainer_on("cuda", wall_scene, tiny_model, config=config)
-        trainer.cuda_graphs = graphs
+        trainer = trainer_on("cuda", wall_scene, tiny_model, config=config, cuda_graphs=graphs)
         found[graphs] = losses_of(trainer, 22)
         method = trainer.method
         assert isinstance(method, WildGS)
