@@ -2,7 +2,7 @@
 
     python benchmarks/gpu_report.py OUTPUT
 
-What a stage did not leave is null; its exit code says why.
+What a stage did not leave is null or empty; its exit code says why.
 """
 
 from __future__ import annotations
@@ -109,15 +109,18 @@ def training(run: Path) -> dict[str, Any] | None:
 def gather(output: Path) -> dict[str, Any]:
     """The whole report."""
     parts = output / "parts"
-    render = read_json(parts / "render.out")
+    rows = {
+        name: read_lines(parts / f"{name}.out")
+        for name in ("eager", "graphs", "profile", "steps", "features")
+    }
+    render = read_lines(parts / "render.out")
     return {
         "device": device(),
         "versions": versions(),
         "stages": read_lines(parts / "stages.jsonl"),
-        "tests": tests(parts / "parity.xml"),
-        "train_step": read_json(parts / "steps.out"),
-        "train_step_without_graphs": read_json(parts / "eager.out"),
-        "render": render and [{**row, "frames_per_second": 1e3 / row["forward_ms"]} for row in render],
+        "tests": {name: tests(parts / f"{name}.xml") for name in ("parity", "tests")},
+        **rows,
+        "render": [{**row, "frames_per_second": 1e3 / row["forward_ms"]} for row in render],
         "training": training(output / "run"),
     }
 

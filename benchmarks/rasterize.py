@@ -2,7 +2,7 @@
 
     python benchmarks/rasterize.py                 the table: N in 10k, 100k, 1M at three sizes
     python benchmarks/rasterize.py --quick         100k at 640 x 480 alone
-    python benchmarks/rasterize.py --json          the rows, and nothing else, on stdout
+    python benchmarks/rasterize.py --json          a row a line, each as soon as it is measured
 
 The scene: half of the Gaussians on a facade at depth 4, the rest uniform between depths 2 and 6, log-normal scales
 around 0.01, opacities uniform in [0, 1], focal length 0.9 widths. A run blends three channels and depth. Forward
@@ -233,7 +233,7 @@ def main() -> None:
     parser.add_argument(
         "--reference", action="store_true", help="time the dense reference too, where feasible"
     )
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON and nothing else")
+    parser.add_argument("--json", action="store_true", help="a row a line, and nothing else, on stdout")
     options = parser.parse_args()
     counts, sizes = options.n, [tuple(int(v) for v in size.split("x")) for size in options.sizes]
     if options.quick:
@@ -252,7 +252,10 @@ def main() -> None:
                     file=sys.stderr,
                 )
                 rows.append(row)
-    print(json.dumps([asdict(row) for row in rows], indent=1) if options.json else table(rows))
+                if options.json:
+                    print(json.dumps(asdict(row)), flush=True)
+    if not options.json:
+        print(table(rows))
 
 
 if __name__ == "__main__":

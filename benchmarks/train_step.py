@@ -3,7 +3,7 @@
     python benchmarks/train_step.py                       100k and 1M Gaussians, 500x375 and 1000x750
     python benchmarks/train_step.py --quick               100k Gaussians, 480x360
     python benchmarks/train_step.py --eager               on CUDA: networks without graphs
-    python benchmarks/train_step.py --json                the rows, and nothing else, on stdout
+    python benchmarks/train_step.py --json                a row a line, each as soon as it is measured
 
 The scene is the demo's landmark with its points multiplied to N; both methods start from the same points and
 train in turns, so that a noisy machine slows both alike. A step is the mean over as many as the encoder's rhythm
@@ -284,24 +284,27 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="100k Gaussians at 480x360 alone")
-    parser.add_argument("--json", action="store_true", help="only the rows, on stdout")
+    parser.add_argument("--json", action="store_true", help="a row a line, and nothing else, on stdout")
     parser.add_argument("--steps", type=int, default=12, help="timed steps a method")
     parser.add_argument("--n", type=int, help="this many Gaussians alone")
+    parser.add_argument("--width", type=int, help="this many pixels on the long side alone")
     parser.add_argument("--eager", action="store_true", help="on CUDA: networks without graphs")
     options = parser.parse_args()
     device = default_device()
     sizes = ((480, 360),) if options.quick else SIZES
+    if options.width:
+        sizes = ((options.width, 0),)
     counts = (options.n,) if options.n else (COUNTS[:1] if options.quick else COUNTS)
-    rows: list[Row] = []
     for width, _ in sizes:
         with tempfile.TemporaryDirectory() as folder:
             scene = make_scene(Path(folder) / "scene", width)
             for n in counts:
-                rows += measure(scene, n, options.steps, device, WildGSConfig(), graphs=not options.eager)
-                if not options.json:
-                    show(rows[-len(METHODS) :])
-    if options.json:
-        print(json.dumps([asdict(row) for row in rows], indent=1))
+                rows = measure(scene, n, options.steps, device, WildGSConfig(), graphs=not options.eager)
+                if options.json:
+                    for row in rows:
+                        print(json.dumps(asdict(row)), flush=True)
+                else:
+                    show(rows)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""A device that says it is CUDA and computes on the CPU: what a GPU would be told to do, without one.
+"""A device that says it is CUDA and computes on the CPU: counts what a GPU would be told to do, without one.
 
-Tensors on it are real, so whole trainings run, and three things show that otherwise only a GPU shows: operands that
-lie on different devices (an error, as there), how many kernels a step launches, and where the host waits for the
-device. Times mean nothing here.
+Tensors on it are real, so whole training steps run, and it counts how many kernels a step launches and where the
+host waits for the device. It says nothing about times, streams, graph capture or gsplat's interface; tests check
+those against torch and the installed gsplat.
 
     import pretend_cuda
     pretend_cuda.prepare()          # before torch is imported; needs g++

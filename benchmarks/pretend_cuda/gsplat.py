@@ -91,19 +91,18 @@ class StandIn:
 
     def rasterize_to_pixels(
         self, means2d: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, *_: Any,
-        backgrounds: Tensor | None, packed: bool, absgrad: bool,
+        packed: bool, absgrad: bool,
     ) -> Any:  # fmt: skip
         """Sums of values, and alpha."""
         assert self.projection is not None
         seen = dataclasses.replace(self.projection, depths=self.projection.depths.detach())
 
-        def compute(means2d: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, behind: Any) -> Any:
+        def compute(means2d: Tensor, conics: Tensor, values: Tensor, opacities: Tensor) -> Any:
             moved = dataclasses.replace(seen, means2d=means2d[0], conics=conics[0], opacities=opacities[0])
-            background = None if behind is None else behind[0]
-            rendering = blend(moved, values[0], background=background, depth=False)
+            rendering = blend(moved, values[0], depth=False)
             return rendering.colors[None], rendering.alpha[None, ..., None]
 
-        return _Kernel.apply("rasterise", compute, means2d, conics, values, opacities, backgrounds)
+        return _Kernel.apply("rasterise", compute, means2d, conics, values, opacities)
 
     def spherical_harmonics(
         self, degree: int, directions: Tensor, sh: Tensor, *, masks: Tensor | None

@@ -161,7 +161,6 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     downloads = bool(there) and device is not None and not _is_cuda(device)
     concerned = bool(there) or _is_cuda(device)
     if concerned:
-        _check(name, there, here)
         _note_waits(name, args, kwargs, here, downloads)
     result = function(*tree_map(_inner, args), **tree_map(_inner, _without_pinning(kwargs)))
     if not concerned or downloads:
@@ -194,13 +193,6 @@ def _inner(leaf: Any) -> Any:
 
 def _without_pinning(kwargs: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in kwargs.items() if name != "pin_memory"}
-
-
-def _check(name: str, there: list[Any], here: list[Tensor]) -> None:
-    """Operands must share a device; torch lets copies and indices be elsewhere."""
-    if there and here and name not in ("_to_copy", "copy_") and not name.lstrip("_").startswith("index"):
-        shapes = ", ".join(str(list(tensor.shape)) for tensor in here)
-        raise RuntimeError(f"{name}: expected all tensors on one device, but {shapes} lie on the CPU")
 
 
 def _note_waits(name: str, args: Any, kwargs: dict[str, Any], here: list[Tensor], downloads: bool) -> None:
@@ -253,8 +245,9 @@ def pretend() -> Iterator[Record]:
             (_foreach_utils, "_foreach_supported_types", [Tensor, torch.nn.Parameter, Pretended]),
             (torch.cuda, "is_available", lambda: True),
             (torch.cuda, "_lazy_init", lambda: None),
-            (torch.cuda, "is_bf16_supported", lambda *_: True),
+            (torch.cuda, "is_bf16_supported", lambda **_: True),
             (torch.cuda, "synchronize", lambda *_: None),
+            (torch.cuda, "get_device_capability", lambda *_: (9, 0)),
             (torch.cuda, "get_rng_state", lambda *_: torch.get_rng_state()),
             (torch.cuda, "set_rng_state", lambda *_: None),
             (torch.cuda, "mem_get_info", lambda *_: (70 << 30, 80 << 30)),
@@ -263,7 +256,7 @@ def pretend() -> Iterator[Record]:
             (torch.cuda, "get_device_name", lambda *_: "no GPU, pretended"),
             (torch.cuda, "graph_pool_handle", graphs.graph_pool_handle),
             (torch.cuda, "make_graphed_callables", graphs.make_graphed_callables),
-            (backend, "_gsplat", lambda: gsplat),
+            (backend, "load_gsplat", lambda: gsplat),
         ):
             stack.enter_context(patch.object(target, name, value))
         try:

@@ -98,3 +98,13 @@ def test_json_from_the_command_line(tmp_path):
     report = json.loads(done.stdout)
     assert {entry["state"] for entry in report} <= {"works", "missing", "broken"}
     assert {"name", "state", "detail", "remedy"} == set(report[0])
+
+
+def test_gsplat_that_is_not_built_comes_with_the_command_that_builds_it(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    monkeypatch.setattr("wildgs.rasterize.gsplat_library.toolkit_problem", lambda: None)
+    check = doctor._gsplat("rasteriser on CUDA")
+    assert check.state == "missing"
+    assert (check.remedy or "").endswith("wildgs doctor --build-gsplat")
+    monkeypatch.setattr("wildgs.rasterize.gsplat_library.toolkit_problem", lambda: "nvcc is not installed")
+    assert doctor._gsplat("rasteriser on CUDA").state == "broken"

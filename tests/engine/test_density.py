@@ -164,3 +164,10 @@ def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:
     torch.testing.assert_close(control.gradient_sum, expected)
     assert torch.equal(control.seen, projection.visible.float())
     torch.testing.assert_close(control.reach, projection.radii / 64)
+
+
+def test_restored_statistics_are_where_the_gaussians_are() -> None:
+    """A resumed run may densify before a step has gathered anything."""
+    control = DensityControl(DensityConfig(), 1.0, 5, "meta")
+    control.restore(DensityControl(DensityConfig(), 1.0, 5).state())
+    assert {value.device.type for value in control.state().values()} == {"meta"}

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.memory_views import GonePhotos
-from wildgs.engine.autosave import Autosave, AutosaveConfig
+from wildgs.engine.autosave import Autosave
 from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.safety import PATIENCE, TrainingDivergedError
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
@@ -74,7 +74,7 @@ def test_ten_bad_steps_in_a_row_end_the_run(wall_scene: Scene, monkeypatch) -> N
     trainer = trainer_for(wall_scene, 40)
     spoil_losses(trainer, set(range(5, 40)), monkeypatch)
     saved: list[int] = []
-    autosave = Autosave(lambda: saved.append(trainer.step), AutosaveConfig(checkpoint_every=1), 0)
+    autosave = Autosave(lambda: saved.append(trainer.step), every=1)
     with (
         pytest.warns(WildGSWarning),
         pytest.raises(TrainingDivergedError, match=r"10 steps in a row.*newest checkpoint"),
@@ -130,8 +130,7 @@ def test_saving_by_steps_and_by_time(monkeypatch) -> None:
     now = [0.0]
     monkeypatch.setattr("wildgs.engine.autosave.time.monotonic", lambda: now[0])
     saved: list[float] = []
-    config = AutosaveConfig(checkpoint_every=100, checkpoint_minutes=1.0)
-    autosave = Autosave(lambda: saved.append(now[0]), config, 0)
+    autosave = Autosave(lambda: saved.append(now[0]), every=100, minutes=1.0)
     for step in range(1, 251):
         now[0] += 1.0  # seconds
         autosave(report_at(step))
@@ -149,7 +148,7 @@ def test_a_full_disk_does_not_end_training(monkeypatch) -> None:
         if len(attempts) < 3:
             raise UserError("step_1 cannot be written (No space left on device)")
 
-    autosave = Autosave(save, AutosaveConfig(checkpoint_every=10**6, checkpoint_minutes=1.0), 0)
+    autosave = Autosave(save, every=10**6, minutes=1.0)
 
     def train() -> None:
         for step in range(1, 300):

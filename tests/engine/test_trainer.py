@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -162,3 +163,25 @@ def test_missing_pretrained_weights_do_not_stop_training(wall_scene: Scene, tiny
         trainer = trainer_for(wall_scene, missing, 2)
     trainer.run()
     assert trainer.step == 2
+
+
+def test_no_graph_of_a_step_lives_on_into_the_next(
+    wall_scene: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What an observer holds must not: its gradient accumulators would invalidate the capture of a CUDA graph."""
+    trainer = trainer_for(wall_scene, tiny_model, 4)
+    forward, last, alive = trainer.method.training_pass, [], []
+
+    def watched(*args, **kwargs):
+        alive.extend(reference() is not None for reference in last)
+        output = forward(*args, **kwargs)
+        last[:] = [weakref.ref(tensor) for tensor in (output.rendering.colors, output.projection.means2d)]
+        return output
+
+    monkeypatch.setattr(trainer.method, "training_pass", watched)
+    reports: list[StepReport] = []
+    trainer.run([reports.append])
+    assert alive == [False] * 6
+    for report in reports:
+        tensors = [*vars(report.losses).values(), *vars(report.rendering).values(), report.visibility]
+        assert all(tensor.grad_fn is None for tensor in tensors)

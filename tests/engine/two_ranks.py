@@ -112,12 +112,6 @@ def mistakes(output: Path, team: Team) -> None:
                 warnings.warn("of both", WildGSWarning, stacklevel=1)
         return len(caught)
 
-    def flip_a_bit() -> None:
-        values = torch.arange(5.0)
-        if team.rank == 1:
-            values.view(torch.int32)[3] ^= 1
-        team.verify(7, {"same": torch.ones(3), "flipped": values})
-
     def unlike_sizes() -> None:
         zero = torch.zeros(())
         team.average([torch.nn.Parameter(torch.zeros(3 + team.rank))], Losses(zero, zero, zero, zero))
@@ -144,7 +138,6 @@ def mistakes(output: Path, team: Team) -> None:
     listen("from_first", lambda: team.from_first(lambda: f"by {team.rank}"))
     listen("least", lambda: team.least(5 - team.rank))
     listen("unlike_facts", lambda: team.require_same({"photos": f"{8 + team.rank}"}))
-    listen("flip_a_bit", flip_a_bit)
     listen("unlike_sizes", unlike_sizes)
     listen("partly_without_gradient", partly_without_gradient)
     listen("stop", stop)

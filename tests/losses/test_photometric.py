@@ -13,7 +13,7 @@ from wildgs.losses.evidence import (
     transient_evidence,
 )
 from wildgs.losses.photometric import masked_photometric
-from wildgs.losses.ssim import _ssim_by_convolution, gaussian_taps, ssim
+from wildgs.losses.ssim import _ConvolutionSSIM, gaussian_taps, ssim
 
 
 def naive_ssim(x: np.ndarray, y: np.ndarray) -> float:
@@ -79,7 +79,7 @@ def test_ssim_gradient_by_finite_differences(shape):
 
 def test_kernels_and_convolutions_agree_in_value_and_gradient():
     results = []
-    for function in (ssim, _ssim_by_convolution):
+    for function in (ssim, _ConvolutionSSIM.apply):
         x, y = (p.requires_grad_() for p in pictures(23, 31))
         value = function(x, y)
         (3 * value).backward()
@@ -256,6 +256,37 @@ def test_hiding_a_wrong_region_lowers_the_loss():
     masked_photometric(photo, render, visibility).backward()
     assert visibility.grad[10:22, 10:22].mean() > 0
     assert visibility.grad[10:22, 10:22].mean() > 10 * visibility.grad[0:2].abs().mean()
+
+
+def test_convolutions_never_run_in_tf32(monkeypatch: pytest.MonkeyPatch):
+    """E[x^2] - E[x]^2 cancels with ten bits of mantissa; neither value nor gradient may be computed so."""
+    convolve = torch.nn.functional.conv2d
+
+    def rounds_as_tensor_cores_do(x: torch.Tensor, weight: torch.Tensor, **options):
+        if torch.backends.cudnn.allow_tf32:
+            x, weight = ((t.view(torch.int32) + 0x1000 & -0x2000).view(torch.float32) for t in (x, weight))
+        return convolve(x, weight, **options)
+
+    monkeypatch.setattr(torch.nn.functional, "conv2d", rounds_as_tensor_cores_do)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    generator = torch.Generator().manual_seed(0)
+    x = 0.7 + 0.02 * torch.rand(24, 32, 3, generator=generator)
+    y = x + 0.004 * torch.rand(24, 32, 3, generator=generator)
+    leaves = [x.requires_grad_(), y.requires_grad_()]
+    wanted, found = ssim(*leaves), _ConvolutionSSIM.apply(*leaves)
+    assert float(found.detach()) == pytest.approx(float(wanted.detach()), abs=1e-3)
+    gradients = [torch.autograd.grad(value, leaves) for value in (found, wanted)]
+    for one, other in zip(*gradients, strict=True):
+        assert float((one - other).norm() / other.norm()) < 0.01
+    assert torch.backends.cudnn.allow_tf32
+
+
+def test_convolutions_stay_on_their_device():
+    pictures = [torch.empty(9, 12, 3, device="meta", requires_grad=True) for _ in range(2)]
+    value = ssim(*pictures)
+    value.backward()
+    assert value.device.type == "meta"
+    assert [picture.grad.device.type for picture in pictures if picture.grad is not None] == ["meta", "meta"]
 
 
 def test_cells_with_observations_are_proven_static():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from wildgs.model.encoder import RESNET_WIDTHS, FrozenBatchNorm, SqueezeNetEncod
 from wildgs.model.feature_cache import FeatureCache, pack, unpack
 from wildgs.model.parsing import Parsing
 from wildgs.model.precision import lay_out_channels_last, set_precision
+from wildgs.model.replays import MOST_GRAPHS
 
 
 @pytest.fixture(scope="module", params=[SQUEEZENET, None], ids=["squeezenet", "resnet"])
@@ -295,3 +297,21 @@ def test_a_mask_far_out_comes_back(start: float) -> None:
     optimizer.step()
     assert float(parsing.mask_head.bias.detach()) == start, "further out there is nothing to go to"
     assert float(before) != start
+
+
+def test_all_shapes_and_stages_fit_into_the_graphs(parsing: Parsing, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos of every shape, with and without the encoder learning; the mask's pause records nothing."""
+    large = Parsing(ParsingConfig(max_side=256), parsing.encoder)
+    keys = set()
+
+    def remember(network, modules, image, settings):
+        keys.add((tuple(image.shape), *settings))
+        return torch.zeros(1, 1, 4, 4), torch.zeros(16)
+
+    monkeypatch.setattr(large, "replays", remember)
+    monkeypatch.setattr(large, "_networks", lambda *_: (torch.zeros(1, 1, 4, 4), torch.zeros(16)))
+    for short in range(60, 520, 20):
+        for size in ((short, 512), (512, short)):
+            for encoder, mask in product((True, False), repeat=2):
+                large(torch.zeros(*size, 3), learn_encoder=encoder, learn_mask=mask)
+    assert len(keys) <= MOST_GRAPHS

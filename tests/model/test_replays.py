@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from wildgs.errors import WildGSWarning
+from wildgs.model import replays as replays_module
 from wildgs.model.replays import EAGER_CALLS, MOST_GRAPHS, Replays
 
 
@@ -122,4 +123,48 @@ def test_a_copy_has_nothing_recorded(monkeypatch: pytest.MonkeyPatch, layer: nn.
     twin = copy.deepcopy(replays)
     assert twin.on
     call(twin, layer)
+    assert len(recorded) == 1
+
+
+class Noisy(nn.Module):
+    """A network whose last parameter gets another gradient each time, as one that is summed with atomics does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.large, self.small = nn.Linear(64, 64), nn.Parameter(torch.ones(1))
+
+    def forward(self, x: Tensor) -> tuple[Tensor]:
+        return (self.large(x) + self.small - self.small.detach(),)
+
+
+@pytest.mark.parametrize(("change", "accepted"), [(1.1, True), (40.0, False)])
+def test_a_small_gradient_that_varies_does_not_reject_a_recording(
+    monkeypatch: pytest.MonkeyPatch, change: float, accepted: bool
+):
+    network = Noisy()
+    learnt = list(network.parameters())
+    x = torch.randn(8, 64, generator=torch.Generator().manual_seed(1))
+    wanted = replays_module._values_and_gradients(network, x, learnt)
+    with torch.no_grad():
+        wanted[1][-1].mul_(change)
+    found = replays_module._values_and_gradients(network, x, learnt)
+    assert all(map(replays_module._alike, wanted, found)) is accepted
+
+
+def test_streams_are_overridden_while_recording_alone(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
+    said: list[object] = []
+    monkeypatch.setattr(torch.autograd.graph, "set_override_stale_capture_stream", said.append, raising=False)
+    record, recorded = recorder()
+
+    def records(*arguments, **keywords):
+        said.append("record")
+        return record(*arguments, **keywords)
+
+    monkeypatch.setattr(torch.cuda, "make_graphed_callables", records)
+    replays = Replays()
+    replays.switch(True)
+    for _ in range(EAGER_CALLS + 2):
+        call(replays, layer)
+    assert said == [True, "record", False]
     assert len(recorded) == 1

@@ -7,7 +7,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.model.triplane import PLANE_AXES, VIEW_AXIS, Box, project_cloud, robust_box, sample_planes
+from wildgs.model.triplane import (
+    PLANE_AXES,
+    VIEW_AXIS,
+    Box,
+    _nearest_per_cell,
+    project_cloud,
+    robust_box,
+    sample_planes,
+)
 
 RED, GREEN, BLUE = torch.eye(3)
 
@@ -139,3 +147,32 @@ def test_normalised_coordinates_span_the_box() -> None:
     box = Box(torch.tensor([-1.0, 0.0, 2.0]), torch.tensor([1.0, 4.0, 3.0]))
     corners = torch.stack([box.low, box.high, (box.low + box.high) / 2])
     torch.testing.assert_close(box.normalize(corners), torch.tensor([[-1.0] * 3, [1.0] * 3, [0.0] * 3]))
+
+
+def test_what_runs_on_a_gpu_stays_there() -> None:
+    """By tensors without numbers that know their device: an operand in main memory is an error."""
+    points, colors = (torch.empty(60, 3, device="meta") for _ in range(2))
+    with pytest.raises(RuntimeError, match="device"):
+        points + torch.ones(60, 3)
+    keep = torch.empty(60, dtype=torch.bool, device="meta")
+    pictures = project_cloud(points, colors, 8, keep)
+    assert (pictures.shape, pictures.device.type) == ((3, 2, 4, 8, 8), "meta")
+    planes = torch.empty(3, 5, 8, 8, device="meta", requires_grad=True)
+    sampled = sample_planes(planes, points)
+    assert (sampled.shape, sampled.device.type) == ((60, 5), "meta")
+    sampled.sum().backward()
+    assert planes.grad is not None
+    assert planes.grad.device.type == "meta"
+
+
+def test_rejected_points_share_no_cell_and_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scatter that a GPU does, where points that do not count are kept out of one another's way."""
+    generator = torch.Generator().manual_seed(0)
+    points = 2.4 * torch.rand(500, 3, generator=generator) - 1.2
+    inside = (points.abs() <= 1).all(dim=-1)
+    wanted = _nearest_per_cell(points[inside], inside[inside], 8)
+    for without in ("", "spread_rejected"):
+        monkeypatch.setenv("WILDGS_WITHOUT", without)
+        winner, hit = _nearest_per_cell(points, inside, 8)
+        assert torch.equal(hit, wanted[1])
+        assert torch.equal(points[winner][hit], points[inside][wanted[0]][hit])

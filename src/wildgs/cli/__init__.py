@@ -80,7 +80,8 @@ def _dispatch(arguments: list[str]) -> None:
         raise UserError(f"there is no verb {verb!r}; `wildgs --help` lists them")
     if processes.world_size() > 1 and verb not in DISTRIBUTED:
         raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
-    _run(verb, rest)
+    with processes.library_environment():
+        _run(verb, rest)
 
 
 def _run(verb: str, arguments: list[str]) -> None:

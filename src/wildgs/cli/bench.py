@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,8 @@ from wildgs.scene.config import DataConfig
 if TYPE_CHECKING:
     from wildgs.evaluation.benchmark import Row
 
+RANK_0_REPORTS = 10.0
+"""Seconds that other ranks wait before they end with a mistake that rank 0 reports."""
 WIDTH_IN_FILES = 240
 """Characters that the printed table may take where no terminal has to show it."""
 SHOWN = ("output", "suite", "methods", "variant", "seeds", "lpips", "data.downscale", "train.steps")
@@ -31,9 +34,10 @@ SHOWN = ("output", "suite", "methods", "variant", "seeds", "lpips", "data.downsc
 class Command:
     """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
 
-    The same command resumes where it stopped and skips finished runs; with more scenes, methods, variants or
-    seeds it runs what is new. The table (table.md, table.csv, table.json) is rewritten after every run.
-    Started by torchrun, every process takes the next run that nobody has.
+    The same command goes on where it stopped and skips what is done; with more scenes, methods, variants or
+    seeds it does what is new. The table (table.md, table.csv, table.json) is written anew after every run.
+    Several processes with one --output share the work, started by torchrun or by this command several times: each
+    takes the next run that no other one trains.
 
     Example: wildgs bench scenes/gate --output bench --steps 3000 --downscale 2 --methods 3dgs wildgs
     """
@@ -67,6 +71,16 @@ def run(command: Command) -> None:
     Raises:
         UserError: The command makes no sense, or some runs failed.
     """
+    if not processes.rank():
+        return _run(command)
+    try:
+        _run(command)
+    except UserError as error:
+        time.sleep(RANK_0_REPORTS)  # torchrun ends all processes with the first that fails
+        raise ReportedError(str(error)) from error
+
+
+def _run(command: Command) -> None:
     import wildgs
 
     if command.train.seed != TrainConfig().seed:
@@ -94,10 +108,9 @@ def run(command: Command) -> None:
             observers=[screen.step],
             announce=announce,
         )
-    _print_table(done.rows)
+    if first:
+        _print_table(done.rows)
     console.print(f"{command.output / 'table.md'}, table.csv and table.json hold the table")
-    if done.failures and not first:
-        raise ReportedError("a run of the bench failed")
     if done.failures:
         title, reason = next(iter(done.failures.items()))
         raise UserError(

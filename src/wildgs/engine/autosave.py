@@ -30,6 +30,7 @@ class Autosave:
         minutes: float = 10.0,
         step: int = 0,
         rescue: Callable[[], Path] | None = None,
+        least_seconds: float = 0.0,
     ) -> None:
         """Sets up an `Autosave`.
 
@@ -39,18 +40,22 @@ class Autosave:
             minutes: Minutes between checkpoints; whichever comes first.
             step: The step of the newest checkpoint.
             rescue: Writes the state to another place, where the last checkpoint cannot be written to its own.
+            least_seconds: Time between two checkpoints, however many steps it is.
         """
         self._save, self._rescue = save, rescue
         self.every, self.minutes = every, minutes
         self.saved_step = step
         self._due = self._next_time()
+        self._least_seconds = least_seconds
+        self._saved_at = float("-inf")
 
     def _next_time(self) -> float:
         return time.monotonic() + 60 * self.minutes
 
     def __call__(self, report: StepReport) -> None:
         """Saves if it is time to; where that fails, warns and tries again a minute later."""
-        on_step = report.falls_on(self.every)
+        rested = time.monotonic() - self._saved_at >= self._least_seconds
+        on_step = rested and report.falls_on(self.every)
         if report.skipped is not None or not (on_step or time.monotonic() >= self._due):
             return
         try:
@@ -68,6 +73,7 @@ class Autosave:
         if step > self.saved_step:
             self._save()
             self.saved_step = step
+            self._saved_at = time.monotonic()
             self._due = self._next_time()
 
     def save_last(self, step: int, *, hurry: bool = False) -> None:

@@ -1,11 +1,10 @@
-"""What ranks exchange, without knowing what training is: sums over flat buckets, fingerprints, mistakes."""
+"""What ranks exchange, without knowing what training is: sums over flat buckets, and errors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 from torch import distributed as dist
 
@@ -14,9 +13,6 @@ from wildgs.errors import ReportedError, UserError
 BUCKET_ELEMENTS = 1 << 22
 """Tensors smaller than this travel together, in messages of at most about twice so many numbers: 16 MB and more
 fill any network, and single messages for a network's hundreds of small tensors would wait for latency."""
-
-_CHUNK = 1 << 22
-_ODD = -7046029254386353131  # 2^64 / golden ratio as a signed number: spreads the positions of equal values
 
 
 @torch.no_grad()
@@ -56,28 +52,6 @@ def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
             bucket, count = [], 0
     if bucket:
         yield bucket
-
-
-@torch.no_grad()
-def fingerprints(state: Mapping[str, Tensor]) -> dict[str, int]:
-    """A 64-bit fingerprint of every tensor's bits, computed where the tensor lies.
-
-    Good against accidents: any single changed bit, and moved values, change it. Not against malice.
-    """
-    names = list(state)
-    sums = [_fingerprint(state[name].detach()) for name in names]
-    return dict(zip(names, (int(value) for value in sums), strict=True))
-
-
-def _fingerprint(tensor: Tensor) -> Int[Tensor, ""]:
-    flat = tensor.contiguous().reshape(-1).view(torch.uint8)
-    words = flat.view(torch.int32) if flat.numel() % 4 == 0 and flat.storage_offset() % 4 == 0 else flat
-    total = torch.zeros((), dtype=torch.int64, device=tensor.device)
-    for start in range(0, words.numel(), _CHUNK):
-        part = words[start : start + _CHUNK].long()
-        place = torch.arange(start + 1, start + 1 + part.numel(), device=tensor.device) * _ODD
-        total = total + ((part ^ (place >> 29)) * (place | 1)).sum()
-    return total + tensor.numel()
 
 
 def raise_once(messages: Sequence[str | None], rank: int, own: UserError | None = None) -> None:

@@ -46,22 +46,26 @@ class DensityReport:
 class DensityControl:
     """Gathers screen statistics and edits the Gaussians."""
 
-    def __init__(self, config: DensityConfig, extent: float, num_gaussians: int) -> None:
+    def __init__(
+        self, config: DensityConfig, extent: float, num_gaussians: int, device: torch.device | str = "cpu"
+    ) -> None:
         """Sets up a `DensityControl`.
 
         Args:
             config: Thresholds.
             extent: Radius of the cameras' region, world units.
             num_gaussians: N now.
+            device: Where the Gaussians are.
         """
         self.config = config
         self.extent = extent
-        self._clear(num_gaussians, torch.device("cpu"))
+        self.device = torch.device(device)
+        self._clear(num_gaussians)
 
-    def _clear(self, num_gaussians: int, device: torch.device) -> None:
-        self.gradient_sum = torch.zeros(num_gaussians, device=device)
-        self.seen = torch.zeros(num_gaussians, device=device)
-        self.reach = torch.zeros(num_gaussians, device=device)
+    def _clear(self, num_gaussians: int) -> None:
+        self.gradient_sum = torch.zeros(num_gaussians, device=self.device)
+        self.seen = torch.zeros(num_gaussians, device=self.device)
+        self.reach = torch.zeros(num_gaussians, device=self.device)
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs."""
@@ -69,7 +73,8 @@ class DensityControl:
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Goes on where `state` was taken."""
-        self.gradient_sum, self.seen, self.reach = (state[k] for k in ("gradient_sum", "seen", "reach"))
+        names = ("gradient_sum", "seen", "reach")
+        self.gradient_sum, self.seen, self.reach = (state[name].to(self.device) for name in names)
 
     @torch.no_grad()
     def gather(
@@ -85,10 +90,9 @@ class DensityControl:
         statistics = self.measure(projection)
         if pool is not None:
             statistics = pool(statistics)
-        device = statistics.seen.device
-        self.gradient_sum = self.gradient_sum.to(device) + statistics.gradient_sum
-        self.seen = self.seen.to(device) + statistics.seen
-        self.reach = torch.maximum(self.reach.to(device), statistics.reach)
+        self.gradient_sum = self.gradient_sum + statistics.gradient_sum
+        self.seen = self.seen + statistics.seen
+        self.reach = torch.maximum(self.reach, statistics.reach)
 
     @staticmethod
     @torch.no_grad()
@@ -142,7 +146,7 @@ class DensityControl:
         if not keep.any() and not splits.any():
             return DensityReport(0, 0, 0)
         edit_rows(gaussians, optimizer, keep, added)
-        self._clear(len(gaussians), scales.device)
+        self._clear(len(gaussians))
         return DensityReport(int(clones.sum()), int(splits.sum()), int(prune.sum()))
 
     def _select_large(self, gaussians: Gaussians, largest: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
@@ -153,7 +157,7 @@ class DensityControl:
             allowed = distance.clamp_min(self.extent)
         large = largest > self.config.prune_scale * allowed
         if self.config.prune_reach > 0:
-            large = large | (self.reach.to(large.device) > self.config.prune_reach)
+            large = large | (self.reach > self.config.prune_reach)
         return large
 
     def _select_growing(self) -> Bool[Tensor, "N"]:
@@ -194,7 +198,7 @@ class DensityControl:
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         keep[gaussians.opacities.argsort(stable=True)[:excess]] = False
         edit_rows(gaussians, optimizer, keep, {name: rows[:0] for name, rows in gaussians.rows.items()})
-        gathered = {name: value.to(keep.device)[keep] for name, value in self.state().items()}
+        gathered = {name: value[keep] for name, value in self.state().items()}
         self.restore(gathered)
         return excess
 

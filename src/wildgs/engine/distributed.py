@@ -20,7 +20,7 @@ from torch import Tensor
 from torch import distributed as dist
 
 from wildgs import processes
-from wildgs.engine.collectives import fingerprints, raise_once, sum_over_ranks
+from wildgs.engine.collectives import raise_once, sum_over_ranks
 from wildgs.engine.density import ScreenStatistics
 from wildgs.engine.team import DivergedRanksError, LostRankError, Team
 from wildgs.errors import ReportedError, UserError, WildGSWarning
@@ -134,20 +134,6 @@ class Ranks(Team):
             sum_over_ranks([sums])
             dist.all_reduce(reach, op=dist.ReduceOp.MAX)
         return ScreenStatistics(gradient_sum=sums[0], seen=sums[1], reach=reach)
-
-    def verify(self, step: int, state: Mapping[str, Tensor]) -> None:  # noqa: D102 - as in Team
-        gathered = self._gather(fingerprints(state))
-        for rank, found in enumerate(gathered):
-            unlike = [
-                name for name in gathered[0].keys() | found.keys() if gathered[0].get(name) != found.get(name)
-            ]
-            if unlike:
-                message = (
-                    f"rank {rank} and rank 0 do not hold the same model after step {step}: {len(unlike)} of "
-                    f"{len(found)} tensors differ, {min(unlike)} among them. A fault of memory or hardware, or "
-                    "machines that are not alike; --resume goes on from the newest checkpoint, from before"
-                )
-                raise DivergedRanksError(message) if self.first else ReportedError(message)
 
     def _gather(self, value: Any) -> list[Any]:
         gathered: list[Any] = [None] * self.size

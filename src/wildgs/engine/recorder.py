@@ -86,8 +86,8 @@ class Recorder:
         values = report.losses.as_floats()
         values["num_gaussians"] = report.num_gaussians
         values["steps_per_second"] = report.step / max(report.seconds, 1e-9)
-        if report.output.visibility is not None:
-            values["visibility"] = float(report.output.visibility.detach().mean())
+        if report.visibility is not None:
+            values["visibility"] = float(report.visibility.mean())
         for name, value in values.items():
             self._board.add_scalar(f"train/{name}", value, report.step)
         line = {"step": report.step, "seconds": round(report.seconds, 3), "view": report.view.name, **values}
@@ -97,14 +97,13 @@ class Recorder:
         self._lines.flush()
 
     def _record_pictures(self, report: StepReport) -> None:
-        rendering = report.output.rendering
         pictures = {
             "photo": report.view.read_photo().float() / 255,
-            "render": rendering.colors.detach().clamp(0, 1),
-            "depth": _grey(rendering.depth.detach()),
+            "render": report.rendering.colors.clamp(0, 1),
+            "depth": _grey(report.rendering.depth),
         }
-        if report.output.visibility is not None:
-            pictures["visibility"] = report.output.visibility.detach()[..., None]
+        if report.visibility is not None:
+            pictures["visibility"] = report.visibility[..., None]
         for name, picture in pictures.items():
             self._board.add_image(f"train/{name}", picture, report.step, dataformats="HWC")
 

@@ -19,9 +19,6 @@ from wildgs.version import __version__
 
 Result = TypeVar("Result")
 
-VERIFY_EVERY = 500
-"""Photos between checks that all ranks hold the same bits."""
-
 
 class LostRankError(UserError):
     """Another process of this training ended, or does not answer."""
@@ -109,18 +106,6 @@ class Team:
             LostRankError: A rank is gone.
         """
         return statistics
-
-    def verify(self, step: int, state: Mapping[str, Tensor]) -> None:
-        """Compares fingerprints of tensors that should be the same everywhere.
-
-        Args:
-            step: Named in the message.
-            state: Any tensors by name.
-
-        Raises:
-            DivergedRanksError: They differ.
-            LostRankError: A rank is gone.
-        """
 
 
 def same_everywhere(

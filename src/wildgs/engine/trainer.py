@@ -8,17 +8,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.density import DensityControl, DensityReport
 from wildgs.engine.feed import PhotoFeed
 from wildgs.engine.optimizers import Optimizers, sort_rows
-from wildgs.engine.processor import settle_on_cpu
+from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, falls_on
-from wildgs.engine.team import VERIFY_EVERY, Team, same_everywhere
+from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
 from wildgs.model.feature_cache import FeatureCache
@@ -30,6 +31,7 @@ from wildgs.model.precision import (
     set_precision,
     switch_replays,
 )
+from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
 from wildgs.scene.scene import observed_pixels
 
@@ -41,22 +43,28 @@ FEATURE_CACHE_BYTES = 10**9
 class StepReport:
     """What an observer gets after every step.
 
+    No tensor in it holds the step's autograd graph: a graph that lives on into the next step keeps that step's
+    tile lists in memory, and its gradient accumulators, which are bound to the default stream, would invalidate
+    the capture of a CUDA graph.
+
     Attributes:
         step: Number of steps done, from 1.
-        view: The photo that trained.
-        losses: Every term; tensors, so that nothing waits for the device unless read.
-        output: The forward pass.
+        view: The photo that was trained on.
+        losses: Every term, detached; tensors, so that nothing waits for the device unless they are read.
+        rendering: The rendered photo, detached.
+        visibility: The mask M, detached; None for a method without one.
         num_gaussians: N after the step.
         density: What densification did, where it ran.
-        skipped: Why the step was not taken, where its loss or gradient was no number.
+        skipped: Why the step was skipped, where its loss or gradient was non-finite.
         taken: Steps that this one counts for: photos of all processes.
-        seconds: Training time so far, without what observers take.
+        seconds: Training time so far, without the time that observers take.
     """
 
     step: int
     view: View
     losses: Losses
-    output: TrainingOutput
+    rendering: Rendering
+    visibility: Float[Tensor, "H W"] | None
     num_gaussians: int
     density: DensityReport | None
     seconds: float
@@ -109,11 +117,12 @@ class Trainer:
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
-        self.density = DensityControl(config.density, extent, len(method.gaussians))
+        self.density = DensityControl(config.density, extent, len(method.gaussians), self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
+        self._process = ProcessSettings(self.device)
         self.cuda_graphs = True
         self.feature_cache = FEATURE_CACHE_BYTES
 
@@ -123,35 +132,38 @@ class Trainer:
         Raises:
             TrainingDivergedError: Too many steps in a row had no finite loss or gradient.
         """
-        self.begin()
         try:
+            self.begin()
             while self.step < self.config.steps:
                 report = self.advance()
                 for observer in observers:
                     observer(report)
         finally:
-            set_precision(self.method, torch.float32)
-            switch_replays(self.method, False)
-            keep_features(self.method, None)
+            self.end()
 
     def begin(self) -> None:
-        """Gets the method ready for `advance`, the same on all ranks; `run` does it by itself.
+        """Gets the method and this process ready for `advance`; `run` calls it. `end` undoes it.
 
         Raises:
             UserError: The ranks cannot train one model: their photos, models or versions differ.
         """
-        if self.device.type == "cpu":
-            settle_on_cpu()
+        self._process.begin()
         precision = choose_precision(self.config.precision, self.device)
         self.team.require_same(same_everywhere(self.method, self.views, self.config, precision))
         if self.step == 0:
             with self.team.together():
                 self._prepare()
         self.team.share(self.method.state_dict().values())
-        self._verify()
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
         keep_features(self.method, FeatureCache(self.feature_cache))
+
+    def end(self) -> None:
+        """Undoes `begin`: the method in float32 without graphs, the process's settings as they were before."""
+        set_precision(self.method, torch.float32)
+        switch_replays(self.method, False)
+        keep_features(self.method, None)
+        self._process.end()
 
     def advance(self) -> StepReport:
         """One step: a photo on every rank."""
@@ -174,11 +186,19 @@ class Trainer:
         self.step = min(before + self.team.size, self.config.steps)
         taken = self.step - before
         density = self._control_density(taken)
-        if falls_on(self.step, taken, VERIFY_EVERY) or self.step == self.config.steps:
-            self._verify()
         self.seconds += time.perf_counter() - start
-        count = len(self.method.gaussians)
-        return StepReport(self.step, view, losses, output, count, density, self.seconds, fault, taken)
+        return StepReport(
+            step=self.step,
+            view=view,
+            losses=losses.detached(),
+            rendering=output.rendering.detached(),
+            visibility=None if output.visibility is None else output.visibility.detach(),
+            num_gaussians=len(self.method.gaussians),
+            density=density,
+            seconds=self.seconds,
+            skipped=fault,
+            taken=taken,
+        )
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view)
@@ -220,10 +240,6 @@ class Trainer:
         budget = self.config.density.max_gaussians
         return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
 
-    def _verify(self) -> None:
-        if self.team.size > 1:
-            self.team.verify(self.step, {n: v for n, v in self.state().items() if n != "progress.seconds"})
-
     def _prepare(self) -> None:
         """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
         sort_rows(self.method.gaussians, self.optimizers.rows)
@@ -238,9 +254,7 @@ class Trainer:
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
         state |= {f"density.{name}": value for name, value in self.density.state().items()}
         state["random.generator"] = self.generator.get_state()
-        state["random.torch"] = torch.get_rng_state()
-        if self.device.type == "cuda":
-            state["random.cuda"] = torch.cuda.get_rng_state(self.device)
+        state |= {f"random.{name}": value for name, value in self._process.random_states().items()}
         state["progress.step"] = torch.tensor(self.step)
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
         state["progress.skipped"] = torch.tensor(self.guard.skipped)
@@ -254,9 +268,7 @@ class Trainer:
             warnings.warn(f"{message}; it goes on with these", WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
-        torch.set_rng_state(state["random.torch"])
-        if "random.cuda" in state and self.device.type == "cuda":
-            torch.cuda.set_rng_state(state["random.cuda"], self.device)
+        self._process.set_random_states(_under(state, "random."))
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import filelock
 import torch
 
 from wildgs import processes
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.checkpoint import list_checkpoints
-from wildgs.engine.collectives import raise_once
 from wildgs.engine.distributed import settle
-from wildgs.engine.job_queue import JobQueue
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
@@ -44,6 +45,10 @@ from wildgs.scene import Scene
 from wildgs.version import __version__
 
 MOST_NOTES = 12
+CLAIM_FILE = ".bench.lock"
+FAILURE_FILE = "bench_failure.txt"
+"""In the folder of a run that failed: why. A later bench tries the run again."""
+POLL_SECONDS = 2.0
 
 
 @dataclass(frozen=True)
@@ -124,40 +129,20 @@ def benchmark(
         observers,
         announce or logger.info,
     )
-    queue = JobQueue("bench")
     if processes.world_size() > 1:
         settle()
     base = config or RunConfig()
     methods = default_bench_methods(suite) if methods is None else methods
-    jobs = _plan_on_all(queue, lambda: _plan(request, [Path(s) for s in scenes], base, methods, seeds))
+    jobs = _plan(request, [Path(s) for s in scenes], base, methods, seeds)
     bench = _Bench(request, jobs)
     done = sum(map(bench.is_done, jobs))
-    if queue.first:
+    if processes.rank() == 0:
         logger.info("%d runs, %d of them done already -> %s", len(jobs), done, request.output)
-    for number in queue.take(len(jobs)):
-        if bench.is_done(jobs[number]):
-            continue
-        request.announce(f"run {number + 1} of {len(jobs)}: {jobs[number].title}")
-        bench.do(jobs[number])
-        if queue.first:
-            bench.write_table()
-    failures = {
-        title: why for each in queue.gather("failures", bench.failures) for title, why in each.items()
-    }
-    rows = bench.write_table() if queue.first else []
-    return Benchmark(request.output, rows, len(jobs), failures)
-
-
-def _plan_on_all(queue: JobQueue, plan: Callable[[], list[Job]]) -> list[Job]:
-    """The jobs, which must make sense to all processes; the first one reports what does not."""
-    jobs: list[Job] = []
-    own: UserError | None = None
-    try:
-        jobs = plan()
-    except UserError as error:
-        own = error
-    raise_once(queue.gather("mistakes", None if own is None else str(own)), processes.rank(), own)
-    return jobs
+    for number, job in bench.open_jobs():
+        request.announce(f"run {number + 1} of {len(jobs)}: {job.title}")
+        bench.do(job)
+        bench.write_table()
+    return Benchmark(request.output, bench.write_table(), len(jobs), bench.failures())
 
 
 def _plan(
@@ -184,7 +169,7 @@ class _Bench:
     def __init__(self, request: _Request, jobs: Sequence[Job]) -> None:
         self.request = request
         self.jobs = jobs
-        self.failures: dict[str, str] = {}
+        self._began = time.time()
         lpips, _ = load_lpips(request.lpips)
         self._network = None if lpips is None else lpips.network
         self._scene: tuple[RunConfig, Scene] | None = None
@@ -201,15 +186,52 @@ class _Bench:
         # A finished run whose checkpoints were deleted keeps its scores.
         return same_network or not list_checkpoints(job.folder / CHECKPOINT_FOLDER)
 
+    def open_jobs(self) -> Iterator[tuple[int, Job]]:
+        """Jobs that are neither done nor failed, with their numbers, until none is left; waits for other processes.
+
+        A process that ends without finishing its job leaves it open, and one of the others takes it.
+        """
+        tried: set[int] = set()
+        while True:
+            waiting = False
+            for number, job in enumerate(self.jobs):
+                if number in tried or self._is_closed(job):
+                    continue
+                with _claim(job.folder) as claimed:
+                    waiting |= not claimed
+                    if claimed and not self._is_closed(job):
+                        tried.add(number)
+                        yield number, job
+            if not waiting:
+                return
+            time.sleep(POLL_SECONDS)
+
+    def _is_closed(self, job: Job) -> bool:
+        return self.is_done(job) or self.failure(job) is not None
+
+    def failure(self, job: Job) -> str | None:
+        """Why a job failed since this bench began, in whatever process; None where it did not."""
+        file = job.folder / FAILURE_FILE
+        try:
+            return file.read_text(encoding="utf-8") if file.stat().st_mtime >= self._began else None
+        except OSError:
+            return None
+
+    def failures(self) -> dict[str, str]:
+        """All jobs that failed, by title."""
+        found = {job.title: self.failure(job) for job in self.jobs}
+        return {title: reason for title, reason in found.items() if reason is not None}
+
     def do(self, job: Job) -> None:
-        """Trains and scores what is left of a job; notes its failure where it lies with this run."""
+        """Trains and scores what is left of a job; notes its failure in the run folder."""
         try:
             scene = self._read_scene(job.config)
             train_job(job, scene, self.request)
             self._score(job, scene)
+            (job.folder / FAILURE_FILE).unlink(missing_ok=True)
         except (UserError, MemoryError, torch.OutOfMemoryError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self.failures[job.title] = reason
+            _write_text(job.folder / FAILURE_FILE, reason)
             self.request.announce(f"failed: {reason}")
 
     def _read_scene(self, config: RunConfig) -> Scene:
@@ -306,6 +328,27 @@ def _notes(scores: Sequence[Score]) -> list[str]:
     lines = [note for note in notes if not note.startswith("LPIPS v0.1")]
     more = len(lines) - MOST_NOTES
     return lines[:MOST_NOTES] + ([f"{more} more notes in the runs' metrics.json."] if more > 0 else [])
+
+
+@contextmanager
+def _claim(folder: Path) -> Iterator[bool]:
+    """Whether this process may work in a run folder while the block runs; the claim ends with the process."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / CLAIM_FILE, timeout=0)
+        lock.acquire()
+    except filelock.Timeout:
+        yield False
+        return
+    except NotImplementedError:  # a disk without locks; processes that share it may repeat each other's work
+        yield True
+        return
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
+    try:
+        yield True
+    finally:
+        lock.release()
 
 
 def _write_text(file: Path, text: str) -> None:

@@ -122,9 +122,42 @@ def _cuda_rasterizer() -> Check:
             detail = "this build of torch has no CUDA, though the machine has an NVIDIA driver"
             return Check(name, "missing", detail, _pip("torch", "-U --force-reinstall"))
         return Check(name, "missing", detail)
-    if importlib.util.find_spec("gsplat") is None:
-        return Check(name, "missing", "gsplat is not installed", _pip("gsplat"))
-    return _rasterize_one(name, "cuda")
+    return _gsplat(name)
+
+
+def _gsplat(name: str) -> Check:
+    """Whether gsplat fits, and whether its CUDA extension is built or can be; builds nothing."""
+    from wildgs.errors import UserError
+    from wildgs.rasterize import gsplat_library
+
+    try:
+        gsplat_library.import_gsplat()
+    except UserError as error:
+        state = "missing" if importlib.util.find_spec("gsplat") is None else "broken"
+        return Check(name, state, str(error), _pip(f"'{gsplat_library.REQUIREMENT}'"))
+    if gsplat_library.is_built():
+        return _rasterize_one(name, "cuda")
+    problem = gsplat_library.toolkit_problem()
+    if problem is not None:
+        return Check(name, "broken", f"{problem}: {gsplat_library.build_help()}")
+    detail = "gsplat's CUDA extension is not built yet; the first use builds it, which takes 2 to 15 minutes"
+    return Check(name, "missing", detail, f"{sys.executable} -m wildgs doctor --build-gsplat")
+
+
+def build_gsplat() -> None:
+    """Builds gsplat's CUDA extension, or loads it where it is built.
+
+    Raises:
+        UserError: It cannot be built here.
+    """
+    from wildgs.errors import UserError
+    from wildgs.rasterize import gsplat_library
+
+    gsplat_library.import_gsplat()
+    problem = None if gsplat_library.is_built() else gsplat_library.toolkit_problem()
+    if problem is not None:
+        raise UserError(f"{problem}: {gsplat_library.build_help()}")
+    gsplat_library.load_gsplat()
 
 
 def _rasterize_one(name: str, device: str) -> Check:

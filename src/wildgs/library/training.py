@@ -13,8 +13,10 @@ from typing import Literal
 
 import torch
 
+from wildgs import features
 from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
 from wildgs.engine.autosave import Autosave
+from wildgs.engine.checkpoint_writer import CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team
@@ -23,12 +25,23 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
 from wildgs.library.logs import logger, run_log
 from wildgs.progress import Progress, counter, silent
-from wildgs.runs import CONFIG_FILE, default_device, lock_run, prepare_training, refuse_trained, save_run
+from wildgs.runs import (
+    CHECKPOINT_FOLDER,
+    CONFIG_FILE,
+    default_device,
+    lock_run,
+    prepare_training,
+    refuse_trained,
+    run_state,
+    save_run,
+)
 from wildgs.scene import Scene, load_scene
 from wildgs.scene.carried import describe_carried
 from wildgs.scene.config import parse_bytes
 from wildgs.threads import limited
 
+LEAST_SECONDS_ON_CUDA = 60.0
+"""Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
 RETRY_SHARE = 0.8
 """Share of the Gaussians with which memory ran out that the second try may have."""
 BUDGET = "train.density.max_gaussians"
@@ -277,12 +290,15 @@ def _train_to_end(
     def show(report: StepReport) -> None:
         job.progress(label, report.step, config.train.steps)
 
+    on_cuda = trainer.device.type == "cuda"
+    writer = CheckpointWriter(background=on_cuda and features.is_on("checkpoint_thread"))
     saver = Autosave(
-        lambda: save_run(folder, trainer, config, alignment),
+        lambda: writer.save(folder / CHECKPOINT_FOLDER, *run_state(trainer, config, alignment)),
         every=execution.checkpoint_every,
         minutes=execution.checkpoint_minutes,
         step=trainer.step,
         rescue=rescue,
+        least_seconds=LEAST_SECONDS_ON_CUDA if on_cuda else 0.0,
     )
     with (
         run_log(folder),
@@ -299,10 +315,10 @@ def _train_to_end(
         try:
             trainer.run([recorder, *observers, show, saver, stop])
         except InterruptedTrainingError as interrupt:
-            team.from_first(lambda: saver.save_last(trainer.step, hurry=True))
+            team.from_first(lambda: _save_last(saver, writer, trainer.step, hurry=True))
             interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
             raise
-        saver.save_last(trainer.step)
+        _save_last(saver, writer, trainer.step)
         result = _result(job, config, trainer)
         logger.info(
             "%s: %d steps in %.1f min on %s, %s Gaussians -> %s",
@@ -314,6 +330,13 @@ def _train_to_end(
             folder,
         )
     return result
+
+
+def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:
+    """Saves the last step and returns when it is on the disk; see `Autosave.save_last`."""
+    if not writer.finish():
+        saver.saved_step = 0  # what was being written failed: the last step is to be written again
+    saver.save_last(step, hurry=hurry)
 
 
 def _follow(job: _Job, config: RunConfig, trainer: Trainer) -> TrainedRun:

@@ -31,6 +31,10 @@ class Losses:
     depth: Float[Tensor, ""]
     total: Float[Tensor, ""]
 
+    def detached(self) -> Losses:
+        """The same values without the autograd graph."""
+        return Losses(self.image.detach(), self.mask.detach(), self.depth.detach(), self.total.detach())
+
     def as_floats(self) -> dict[str, float]:
         """The four numbers for a log."""
         names = ("image", "mask", "depth", "total")

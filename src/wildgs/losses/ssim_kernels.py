@@ -8,8 +8,8 @@ results go to that row alone, so results do not depend on how many threads there
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.threads import fetch_add
 
 RADIUS = 5
@@ -17,7 +17,7 @@ BLOCK = 16
 _MATHS = {"reassoc", "contract", "arcp", "nsz"}  # not nnan: a NaN must stay visible
 
 
-@njit(fastmath=_MATHS, error_model="numpy", cache=True)
+@njit(fastmath=_MATHS, error_model="numpy")
 def _filter_row(padded, taps, channels, out):
     """Filter one row that has RADIUS * channels zeros on either side.
 
@@ -36,7 +36,7 @@ def _filter_row(padded, taps, channels, out):
         out[j] = tails + wd * (d0[j] + d1[j]) + we * (e0[j] + e1[j]) + w * centre[j]
 
 
-@njit(nogil=True, fastmath=_MATHS, error_model="numpy", cache=True)
+@njit(nogil=True, fastmath=_MATHS, error_model="numpy")
 def _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums):
     """Rows of `ssim_forward`.
 
@@ -83,7 +83,7 @@ def _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_su
         row_sums[i] = total
 
 
-@njit(nogil=True, fastmath=_MATHS, error_model="numpy", cache=True)
+@njit(nogil=True, fastmath=_MATHS, error_model="numpy")
 def _backward_rows(first, last, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
     """Rows of `ssim_backward`.
 
@@ -114,7 +114,7 @@ def _backward_rows(first, last, x, y, taps, scale, channels, derivatives, grad_x
             out_y[j] = m1[j] + 2 * m2[j] * v[j] + m3[j] * u[j]
 
 
-@njit(nogil=True, error_model="numpy", cache=True)
+@njit(nogil=True, error_model="numpy")
 def ssim_forward(counter, x, y, taps, c1, c2, channels, derivatives, row_sums):
     """Sum the SSIM map per row and keep its derivatives by the window's moments."""
     while True:
@@ -125,7 +125,7 @@ def ssim_forward(counter, x, y, taps, c1, c2, channels, derivatives, row_sums):
         _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums)
 
 
-@njit(nogil=True, error_model="numpy", cache=True)
+@njit(nogil=True, error_model="numpy")
 def ssim_backward(counter, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
     """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept."""
     while True:

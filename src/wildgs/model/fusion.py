@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.config import FusionConfig
 from wildgs.model.precision import MixedModule
+from wildgs.model.split_linear import linear_over_rows
 
 COLOR_CHANNELS = 3
 MAX_SH_DEGREE = 3
@@ -73,9 +73,9 @@ class Fusion(MixedModule):
         output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         with self.mixed(rows.device):
             of_all = self.first_global(global_embedding)
-            hidden = functional.linear(rows, self.first_rows.weight, of_all).relu_()
-            hidden = self.second(hidden).relu_()
-            fused = functional.linear(hidden, output, bias)
+            hidden = linear_over_rows(rows, self.first_rows.weight, of_all).relu_()
+            hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
+            fused = linear_over_rows(hidden, output, bias)
         fused = fused.float()
         if direct is not None:  # it carries the base colour and stays in full precision
             fused = torch.addmm(fused, intrinsic, direct.T)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import AbstractContextManager
 
 import torch
@@ -10,14 +9,6 @@ from torch import nn
 
 from wildgs.model.config import Precision
 from wildgs.model.replays import Replays
-
-# oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024 by itself. A collection
-# of photos of many sizes needs more: two thirds of every step went into compiling again. Read at the first of them.
-os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "8192")
-
-# MKL adds up in an order that goes by where in memory a matrix happens to lie, unless told not to: two equal
-# trainings, or one that was resumed, then part in the last bit. Read at its first call.
-os.environ.setdefault("MKL_CBWR", "AUTO,STRICT")
 
 
 class MixedModule(nn.Module):
@@ -62,14 +53,16 @@ def lay_out_channels_last(module: nn.Module) -> None:
             part.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
-def choose_precision(wish: Precision, device: torch.device) -> torch.dtype:
-    """The dtype for a wish: 'auto' takes bfloat16 where the hardware multiplies it fast.
+def choose_precision(precision: Precision, device: torch.device) -> torch.dtype:
+    """The dtype of a configured precision: 'auto' is bfloat16 where the hardware multiplies it fast.
 
-    On CPUs that is AVX-512 BF16 or AMX; without them bfloat16 is emulated and slower than float32.
+    On CPUs that is AVX-512 BF16 or AMX, on NVIDIA GPUs Ampere or newer; elsewhere bfloat16 is emulated and slower
+    than float32.
     """
-    if wish != "auto":
-        return torch.bfloat16 if wish == "bfloat16" else torch.float32
+    if precision != "auto":
+        return torch.bfloat16 if precision == "bfloat16" else torch.float32
     if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
+        fast = torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.bfloat16 if fast else torch.float32
     probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return torch.bfloat16 if probe is not None and probe() else torch.float32

@@ -7,15 +7,15 @@ channel-first planes touches one cache line a channel. Here a cell's channels li
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.threads import fetch_add
 
 BANDS = 8
 """Row bands a plane, each scattered by one thread alone: no atomics, and the same sums for any thread count."""
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", inline="always")
+@njit(nogil=True, fastmath=True, error_model="numpy", inline="always")
 def _corner(coordinate, resolution):
     """Lower cell and weight of the upper one, clamped to the border as grid_sample's 'border' padding."""
     x = (coordinate + np.float32(1)) * np.float32(0.5 * resolution) - np.float32(0.5)
@@ -24,7 +24,7 @@ def _corner(coordinate, resolution):
     return low, np.float32(x - low)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, fastmath=True, error_model="numpy")
 def sample_forward(counter, planes, points, chunk, out):
     """out[n] = sum of the three planes' bilinear samples; planes are [3, R, R, C], points [N, 3] in [-1, 1]."""
     resolution, channels = planes.shape[1], planes.shape[3]
@@ -52,7 +52,7 @@ def sample_forward(counter, planes, points, chunk, out):
                     out[n, c] += w00 * a[c] + w01 * b[c] + w10 * d[c] + w11 * e[c]
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@njit(nogil=True, fastmath=True, error_model="numpy")
 def sample_backward(counter, gradient, points, out):
     """Adds the gradient of `sample_forward` with respect to its planes into `out` [3, R, R, C]."""
     resolution, channels = out.shape[1], out.shape[3]

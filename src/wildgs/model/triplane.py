@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from wildgs import features
 from wildgs.model.sampling_kernels import sample_backward, sample_forward
 from wildgs.threads import launch
 
@@ -22,6 +23,7 @@ VIEW_AXIS = (2, 0, 1)
 PICTURE_CHANNELS = 4
 """Red, green, blue, validity."""
 POINTS_PER_ITEM = 1024
+REJECTED_CELLS = 4096
 
 
 @dataclass(frozen=True)
@@ -110,14 +112,17 @@ def _nearest_per_cell(
     cells = ((points.T + 1) * (0.5 * resolution)).long().clamp_(0, resolution - 1)
     heights = torch.stack([points[:, axis] for axis in VIEW_AXIS])
     columns, rows = (torch.stack([cells[axes[i]] for axes in PLANE_AXES]) for i in (0, 1))
-    # Points that do not count share a cell of their own behind the others.
-    cell = torch.where(inside, rows * resolution + columns, count)[:, None].expand(-1, 2, -1)
+    index = torch.arange(points.shape[0], device=points.device)
+    # Points that do not count have cells of their own behind the others. Were it a single one, all of them would
+    # wait for each other's atomic minimum there.
+    spread = REJECTED_CELLS if features.is_on("spread_rejected") else 1
+    cell = torch.where(inside, rows * resolution + columns, count + index % spread)[:, None].expand(-1, 2, -1)
     # One integer that orders by distance first and by index second makes scatter-min yield the winner itself.
     distance = torch.stack([1 - heights, 1 + heights], dim=1)
     ordinal = (distance * (2**30 - 1)).long().clamp_(0, 2**31 - 2)
-    key = (ordinal << 32) | torch.arange(points.shape[0], device=points.device)
+    key = (ordinal << 32) | index
     none = torch.iinfo(torch.int64).max
-    best = torch.full((3, 2, count + 1), none, device=points.device).scatter_reduce(2, cell, key, "amin")
+    best = torch.full((3, 2, count + spread), none, device=points.device).scatter_reduce(2, cell, key, "amin")
     best = best[..., :count].reshape(-1)
     hit = best != none
     return torch.where(hit, best & 0xFFFFFFFF, 0), hit
@@ -126,7 +131,7 @@ def _nearest_per_cell(
 def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
     """f_xy + f_yz + f_zx: bilinear samples of the three planes at points, summed.
 
-    Differentiable in the planes; the points take no gradient on the CPU.
+    Differentiable in the planes; the points take no gradient.
 
     Args:
         planes: Feature maps of XY, YZ and ZX.
@@ -135,7 +140,11 @@ def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]
     """
     if planes.device.type == "cpu" and planes.dtype == torch.float32:
         return _SampleOnCPU.apply(planes, points)
-    x, y, z = points.unbind(1)  # no index lists: each would be carried to a GPU, which is waited for
+    if planes.is_cuda and planes.dtype == torch.float32 and features.has_triton("triton_planes"):
+        from wildgs.model.triplane_triton import TritonSample
+
+        return TritonSample.apply(planes, points)
+    x, y, z = points.detach().unbind(1)  # no index lists: each would be carried to a GPU, which is waited for
     grid = torch.stack([x, y, y, z, z, x], dim=1).reshape(-1, 3, 2).permute(1, 0, 2)
     sampled = functional.grid_sample(
         planes, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False

@@ -64,7 +64,6 @@ def project(
     backend: BackendName | None = None,
     near: float = 0.01,
     absgrad: bool = False,
-    packed: bool = False,
 ) -> Projection:
     """Projects Gaussians into a camera and sorts them into tiles, for any number of `blend` calls.
 
@@ -81,8 +80,6 @@ def project(
         backend: Which implementation; None takes `cuda` for tensors on CUDA and `cpu` otherwise.
         near: Depth in world units up to which Gaussians are culled.
         absgrad: Collect absolute screen gradients in `Projection.absgrad` during the backward pass.
-        packed: gsplat's packed mode, which needs less memory where few Gaussians are seen; only the backend `cuda`
-            has it, others go their way regardless.
 
     Raises:
         ValueError: Shapes, devices or number types do not fit, or there is no such backend.
@@ -100,8 +97,7 @@ def project(
         _check(name, tensor, shape, means, backend)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the camera's picture has no pixels: {camera.width} x {camera.height}")
-    options = {"packed": packed} if backend == "cuda" else {}
-    return module.project(means, quats, scales, opacities, camera, near, absgrad, **options)
+    return module.project(means, quats, scales, opacities, camera, near, absgrad)
 
 
 def blend(

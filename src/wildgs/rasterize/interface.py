@@ -71,3 +71,7 @@ class Rendering:
     colors: Float[Tensor, "H W C"]
     depth: Float[Tensor, "H W"]
     alpha: Float[Tensor, "H W"]
+
+    def detached(self) -> Rendering:
+        """The same picture without its autograd graph."""
+        return Rendering(self.colors.detach(), self.depth.detach(), self.alpha.detach())

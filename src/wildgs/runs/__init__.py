@@ -12,14 +12,10 @@ from typing import Any
 
 import filelock
 import torch
+from torch import Tensor
 
 from wildgs.config import RunConfig, read_config, to_plain, write_config
-from wildgs.engine.checkpoint import (
-    Checkpoint,
-    list_checkpoints,
-    load_newest,
-    save_checkpoint,
-)
+from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
@@ -242,13 +238,15 @@ def start_training(
     """
     team = team or Team()
     team.from_first(lambda: _claim(folder, config, scene, progress))
-    with team.together():
+    device = device or default_device()
+    # The trainer keeps the generators' states; the process gets its own back.
+    with team.together(), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.train.seed)
         budget = config.train.density.max_gaussians
         method = create_method(
             config.method, config.model, scene, max_gaussians=budget, seed=config.train.seed
         )
-        return Trainer(method.to(device or default_device()), scene, config.train, team)
+        return Trainer(method.to(device), scene, config.train, team)
 
 
 def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Progress | None) -> None:
@@ -288,6 +286,17 @@ def resume_training(
 
 
 def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Alignment) -> Path:
-    """Writes a checkpoint from which training can go on and every other verb can read."""
+    """Writes a checkpoint from which training can go on and every other verb can read.
+
+    Raises:
+        UserError: It cannot be written.
+    """
+    return save_checkpoint(folder / CHECKPOINT_FOLDER, *run_state(trainer, config, alignment))
+
+
+def run_state(
+    trainer: Trainer, config: RunConfig, alignment: Alignment
+) -> tuple[int, dict[str, Tensor], dict[str, Any]]:
+    """What a checkpoint of a run holds: step, tensors and header."""
     header: dict[str, Any] = {"config": to_plain(config), "alignment": alignment.to_dict()}
-    return save_checkpoint(folder / CHECKPOINT_FOLDER, trainer.step, trainer.state(), header)
+    return trainer.step, trainer.state(), header

@@ -11,8 +11,8 @@ a fixed order: no atomics, the same result for any number of threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.forward_kernels import (
     AHEAD,
     BATCH,
@@ -59,7 +59,7 @@ ROW_ABS, ROW_DEPTH, ROW_COLORS = 6, 8, 9
 BEHIND, REACHED, V_ALPHA, V_DEPTH, V_COLORS = 16, 32, 48, 64, 80
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def load_tile(
     tile, tx, ty, width, height, channels, with_depth, background, final_transmittance, last, out_depth, out_alpha,
     v_colors, v_depth, v_alpha, stride, patch, v,
@@ -77,7 +77,7 @@ def load_tile(
             )  # fmt: skip
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def blend_backward(
     counter, tile_order, offsets, entries, records, values, channels, with_depth, background,
     width, height, final_transmittance, last, out_depth, out_alpha, v_colors, v_depth, v_alpha,
@@ -146,7 +146,7 @@ def blend_backward(
                 )  # fmt: skip
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, inline="always")
 def gather_pair(
     i, position, blocks, batch, channels, with_depth, values, rank, absgrad, stride, v, places, v_color, rows, to
 ):  # fmt: skip
@@ -218,7 +218,7 @@ def gather_pair(
         store_colors(rows, to + ROW_COLORS, v_color, channels)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def store_colors(rows, at, v_color, channels):
     """The channels' part of a pair's row."""
     for k in range(channels):
@@ -228,7 +228,7 @@ def store_colors(rows, at, v_color, channels):
         rows[at + k] = total
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def sum_rows(
     counter, chunk_size, ranks, starts, row_size, rows, channels, conics, opacities,
     v_means2d, v_conics, v_opacities, v_depths, v_colors, v_absolute,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.simd import vmax, vmin, vsqrt
 from wildgs.rasterize.cpu.simd_memory import vload3, vload4
 
@@ -15,7 +15,7 @@ MIN_ALPHA = 1.0 / 255.0
 LOG2_E = 1.4426950408889634
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def rotation(w, x, y, z):
     """Rotation matrix (rows) of a unit quaternion."""
     return (
@@ -25,7 +25,7 @@ def rotation(w, x, y, z):
     )  # fmt: skip
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def matmul(a, b):
     """Product of two 3 x 3 matrices given as rows."""
     return (
@@ -41,7 +41,7 @@ def matmul(a, b):
     )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def camera_numbers(view):
     """The world-to-camera rotation as a tuple, from the flat 3 x 4 matrix."""
     return (
@@ -57,7 +57,7 @@ def camera_numbers(view):
     )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def clamp_limits(lens, width, height):
     """Bounds of x/z and y/z beyond which the projection's Jacobian is held: 0.3 half fields of view outside."""
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -71,7 +71,7 @@ def clamp_limits(lens, width, height):
     )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def footprint(i, quats, scales, R, lens, width, height, x, y, z, iz):
     """U = J R R_q S of sixteen Gaussians (2 x 3), whose square is the 2D covariance.
 

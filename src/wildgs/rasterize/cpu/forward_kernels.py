@@ -11,8 +11,8 @@ magnitude) or outside the picture.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, ask_for_tile, close_tile, open_tile
 from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, REACH, RECORD, TILE, nearest_exponent
 from wildgs.rasterize.cpu.simd import (
@@ -42,7 +42,7 @@ MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def load_batch(begin, count, entries, records, values, channels, tx, ty, batch):
     """Copies the numbers of `count` Gaussians of a tile's list into rows of BATCH floats (see X to BLUE).
 
@@ -74,7 +74,7 @@ def load_batch(begin, count, entries, records, values, channels, tx, ty, batch):
             )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def reach_by_block(count, batch, words):
     """For each block of the tile a word with a bit for every Gaussian of the batch that reaches it."""
     words[:] = 0
@@ -100,7 +100,7 @@ def reach_by_block(count, batch, words):
                 words[row * 4 + column] |= (mask_bits(best + level >= REACH) & valid) << group
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def blend_forward(
     counter, tile_order, offsets, entries, records, values, channels, with_depth, background,
     width, height, out_colors, out_depth, out_alpha, final_transmittance, last,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.reach_kernels import TILE
 from wildgs.rasterize.cpu.simd import select, splat, vmax, vmin
 from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vload3, vstore, vstore3
@@ -13,7 +13,7 @@ LANES = 16
 PATCH = 48  # floats that a block of three channels has
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def aligned(size):
     """A float32 array that starts at a cache line, so that no vector straddles two."""
     raw = np.empty(size + 16, np.float32)
@@ -21,7 +21,7 @@ def aligned(size):
     return raw[skip : skip + size]
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, inline="always")
 def put_rows(patch, per_pixel, picture, x, y, width, height):
     """Writes a block's pixels, row after row in `patch`, to the picture at (x, y), cut at its border."""
     row, count = 4 * per_pixel, min(4, width - x) * per_pixel
@@ -35,7 +35,7 @@ def put_rows(patch, per_pixel, picture, x, y, width, height):
                 picture[at + k] = patch[line * row + k]
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, inline="always")
 def get_rows(patch, per_pixel, picture, x, y, width, height):
     """Reads a block's pixels from the picture; 0 beyond its border."""
     row, count = 4 * per_pixel, min(4, width - x) * per_pixel
@@ -51,7 +51,7 @@ def get_rows(patch, per_pixel, picture, x, y, width, height):
                 patch[line * row + k] = picture[at + k]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def ask_for_tile(tx, ty, width, height, per_pixel, picture, to_write):
     """Asks for the cache lines of a tile in a picture: its rows lie far apart, and no hardware foresees them."""
     for line in range(min(TILE, height - ty * TILE)):
@@ -63,7 +63,7 @@ def ask_for_tile(tx, ty, width, height, per_pixel, picture, to_write):
                 prefetch(picture, at + step)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def open_tile(tx, ty, width, height, stride, sums):
     """Sums 0 and transmittance 1 inside the picture, -1 outside; returns the bits of blocks with pixels inside."""
     alive = 0
@@ -80,7 +80,7 @@ def open_tile(tx, ty, width, height, stride, sums):
     return alive
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def close_tile(
     tx, ty, width, height, channels, with_depth, background, stride, sums, patch, out_colors, out_depth, out_alpha
 ):  # fmt: skip
@@ -115,7 +115,7 @@ def close_tile(
                         out_colors[pixel * channels + k] = value
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def load_block(
     x, y, width, height, channels, with_depth, background, out_depth, out_alpha, v_colors, v_depth, v_alpha,
     patch, v, to_alpha, to_depth, to_colors,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.footprint_kernels import (
     CHUNK,
     DILATION,
@@ -19,7 +19,7 @@ from wildgs.rasterize.cpu.simd_memory import vload, vload2, vload3, vstore3, vst
 from wildgs.threads import fetch_add
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def project_backward(
     counter, means, quats, scales, view, lens, width, height, radii,
     v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
@@ -49,7 +49,7 @@ def project_backward(
                 v_scales[3 * i : 3 * (i + GROUP)] = 0.0
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def project_group_backward(
     i, seen, means, quats, scales, view, lens, width, height,
     v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,

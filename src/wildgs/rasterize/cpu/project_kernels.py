@@ -6,8 +6,8 @@ Arrays are C-contiguous float32 and indexed flat. N must be at least 16: the las
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.footprint_kernels import (
     CHUNK,
     DILATION,
@@ -40,7 +40,7 @@ from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore2, vst
 from wildgs.threads import fetch_add
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def project_forward(
     counter, means, quats, scales, opacities, view, lens, width, height, near,
     means2d, depths, conics, radii, records, boxes, masks, tile_counts,
@@ -82,13 +82,13 @@ def project_forward(
                 tile_counts[g] = count
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, inline="always")
 def pack_box(x0, y0, x1, y1):
     """First and last column and row of tiles in one number, so that it is moved at once."""
     return x0 | (y0 << 16) | (x1 << 32) | (y1 << 48)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def find_tiles(g, x0, y0, x1, y1, records):
     """A Gaussian's mask, and how many tiles it reaches."""
     if x1 - x0 < 4 and y1 - y0 < 4:
@@ -101,7 +101,7 @@ def find_tiles(g, x0, y0, x1, y1, records):
     return -1, count
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def project_group(
     i, means, quats, scales, opacities, view, lens, width, height, near, means2d, depths, conics, records, spans
 ):  # fmt: skip

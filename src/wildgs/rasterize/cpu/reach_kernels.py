@@ -6,8 +6,8 @@ The ellipse is tested against rectangles of pixel centres, exactly but for a sla
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.simd import fma, lane_x, lane_y, mask_bits, vmax, vmin
 
 TILE = 16
@@ -18,7 +18,7 @@ REACH = np.float32(-7.99435344 - 0.01)
 HALF = np.float32(0.5)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def nearest_exponent(x0, y0, x1, y1, A, B, C, y_per_x, x_per_y):
     """Largest value of A x^2 + B x y + C y^2 (negative definite) in the rectangle from (x0, y0) to (x1, y1).
 
@@ -34,7 +34,7 @@ def nearest_exponent(x0, y0, x1, y1, A, B, C, y_per_x, x_per_y):
     return vmax(vertical, horizontal)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def reach(x, y, side, A, B, C, level, y_per_x, x_per_y):
     """Which squares of a 4 x 4 arrangement a Gaussian reaches, as 16 bits.
 
@@ -56,7 +56,7 @@ def reach(x, y, side, A, B, C, level, y_per_x, x_per_y):
     return mask_bits(best + level >= REACH)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def window_mask(i, records, tx, ty):
     """Bits of the 4 x 4 tiles from tile (tx, ty) that the Gaussian of record i reaches."""
     r = i * RECORD
@@ -68,7 +68,7 @@ def window_mask(i, records, tx, ty):
     )  # fmt: skip
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def inside_bits(tx, ty, last_x, last_y):
     """Bits of a 4 x 4 window of tiles at (tx, ty) that lie no further than tile (last_x, last_y)."""
     columns = (1 << min(last_x - tx + 1, 4)) - 1
@@ -76,7 +76,7 @@ def inside_bits(tx, ty, last_x, last_y):
     return (columns * 0x1111) & ((1 << (4 * rows)) - 1)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def count_bits(bits):
     """How many bits are set."""
     count = 0

@@ -37,9 +37,3 @@ def _aligned(size: int, dtype: type) -> np.ndarray:
     raw = np.empty(size + 64 // item, dtype)
     skip = -raw.ctypes.data % 64 // item
     return raw[skip : skip + size]
-
-
-def release_scratch() -> None:
-    """Gives all kept working memory back to the system."""
-    with _lock:
-        _free.clear()

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.threads import fetch_add
 
 CHUNK = 512
@@ -26,7 +26,7 @@ C3 = (
 )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def basis(degree, x, y, z, out):
     """The (degree + 1)^2 basis values of a unit direction."""
     out[0] = C0
@@ -50,7 +50,7 @@ def basis(degree, x, y, z, out):
     out[15] = -C3[0] * x * (xx - F(3.0) * yy)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def basis_gradient(degree, x, y, z, v):
     """Gradient of sum v_k basis_k with respect to the (not yet normalised) direction's x, y and z."""
     gx = gy = gz = F(0.0)
@@ -76,7 +76,7 @@ def basis_gradient(degree, x, y, z, v):
     return gx, gy, gz
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def shade_forward(counter, means, sh, bases, degree, eye, visible, out):
     """Colours max(0, SH(direction) + 0.5) of the visible Gaussians; 0 for the others."""
     n = visible.size
@@ -109,7 +109,7 @@ def shade_forward(counter, means, sh, bases, degree, eye, visible, out):
             )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def shade_backward(counter, means, sh, bases, degree, eye, visible, out, v_out, v_sh, v_means):
     """Gradients of the coefficients and (where `v_means` is no None) of the means."""
     n = visible.size

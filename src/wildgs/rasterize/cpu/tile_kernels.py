@@ -11,8 +11,8 @@ chunk its own places, and the result is that of one thread.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.reach_kernels import RECORD, inside_bits, window_mask
 from wildgs.rasterize.cpu.simd import lowest_bit
 from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write
@@ -22,13 +22,13 @@ AHEAD = 16  # items between asking for what an item needs and using it
 DIGIT = 12  # bits per radix pass, so that the counts stay in the fastest cache
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, inline="always")
 def home_tile(box, tiles_x):
     """The tile in which a box (see `project_kernels.pack_box`) starts."""
     return ((box >> 16) & 0xFFFF) * tiles_x + (box & 0xFFFF)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def count_homes(counter, tile_counts, boxes, tiles_x, cursors):
     """Gaussians that reach tiles per (chunk, home tile), into `cursors`."""
     chunks, n = cursors.shape[0], tile_counts.size
@@ -43,7 +43,7 @@ def count_homes(counter, tile_counts, boxes, tiles_x, cursors):
                 row[home_tile(boxes[g], tiles_x)] += 1
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def place_chunks(cursors, offsets):
     """Turns counts per (chunk, tile) into first positions, tile by tile and chunk by chunk."""
     at = 0
@@ -56,7 +56,7 @@ def place_chunks(cursors, offsets):
     offsets[cursors.shape[1]] = at
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def move_home(
     counter,
     tile_counts,
@@ -101,7 +101,7 @@ def move_home(
                     spans[4 * rank + 3] = tile_counts[g]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def number_slots(spans, starts):
     """First slot of every rank's pairs (and after the last, their number)."""
     total = 0
@@ -112,7 +112,7 @@ def number_slots(spans, starts):
     return total
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def sort_by_depth(depths, tile_counts, keys, order, other_keys, other_order):
     """Gaussians that reach tiles, nearest first, at the same depth in their own order; in the array it returns.
 
@@ -143,7 +143,7 @@ def sort_by_depth(depths, tile_counts, keys, order, other_keys, other_order):
     return order
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
     """One stable counting sort by the `digit` bits from bit `shift` on of the keys less `low`."""
     mask = (1 << digit) - 1
@@ -160,7 +160,7 @@ def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
         out_order[at] = order[i]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors):
     """Pairs per (chunk of the depth order, tile), into `cursors`; the order as ranks, into `nearest`."""
     chunks, count = cursors.shape[0], order.size
@@ -194,7 +194,7 @@ def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors
                         row[(ty + (b >> 2)) * tiles_x + tx + (b & 3)] += 1
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entries):
     """Writes each pair's rank and slot, tile by tile, nearest first."""
     chunks, count = cursors.shape[0], nearest.size
@@ -221,7 +221,7 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
                     slot = write_window(bits, ty * tiles_x + tx, tiles_x, rank, slot, row, entries)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, inline="always")
 def write_window(bits, first, tiles_x, rank, slot, row, entries):
     """Writes a pair for each tile of a window of 4 x 4 whose bit is set; returns the next slot."""
     while bits != 0:
@@ -236,7 +236,7 @@ def write_window(bits, first, tiles_x, rank, slot, row, entries):
     return slot
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True)
 def rank_values(counter, chunk_size, homes, depths, colors, channels, values):
     """Depth, then colours, of every rank: what blending adds up."""
     row = channels + 1

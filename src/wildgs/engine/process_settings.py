@@ -1,0 +1,103 @@
+"""What training changes in the process that runs it, for as long as it runs."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from contextlib import ExitStack
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from wildgs.processes import library_environment
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
+_MMAP_BYTES, _KEPT_BYTES = 2**25, 2**30  # glibc takes no more than 32 MiB for the first
+_DEFAULT_BYTES = 128 * 2**10  # of both
+
+
+class ProcessSettings:
+    """Settings of the process and states of torch's global random generators that belong to one training.
+
+    Between `begin` and `end` they are in force; before and after it the process has its own. The generators'
+    states are taken when this is made, so that a seed set before the method was made holds for training too.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._random = _random_states(device)
+        self._undo: ExitStack | None = None
+
+    def begin(self) -> None:
+        """Puts the training's settings into force; does nothing where they are."""
+        if self._undo is not None:
+            return
+        undo = ExitStack()
+        undo.enter_context(library_environment())
+        undo.callback(_set_random_states, self.device, _random_states(self.device))
+        _set_random_states(self.device, self._random)
+        if self.device.type == "cpu":
+            # Adam's moments of what gets no gradient decay into denormals, which cost up to 100 times as much.
+            undo.callback(torch.set_flush_denormal, _flushes_denormals())
+            torch.set_flush_denormal(True)
+            _keep_freed_memory(True)
+            undo.callback(_keep_freed_memory, False)
+        else:
+            _warn_of_stream_mismatch(False)
+            undo.callback(_warn_of_stream_mismatch, True)
+        self._undo = undo
+
+    def end(self) -> None:
+        """Puts back what was there before `begin`."""
+        if self._undo is not None:
+            self._random = _random_states(self.device)
+            self._undo.close()
+            self._undo = None
+
+    def random_states(self) -> dict[str, Tensor]:
+        """States of the training's generators: `torch`, and on CUDA `cuda`."""
+        return self._random if self._undo is None else _random_states(self.device)
+
+    def set_random_states(self, states: dict[str, Tensor]) -> None:
+        """Continues from what `random_states` gave, on whatever device."""
+        self._random = self._random | {name: states[name] for name in self._random if name in states}
+        if self._undo is not None:
+            _set_random_states(self.device, self._random)
+
+
+def _random_states(device: torch.device) -> dict[str, Tensor]:
+    states = {"torch": torch.get_rng_state()}
+    if device.type == "cuda":
+        states["cuda"] = torch.cuda.get_rng_state(device)
+    return states
+
+
+def _set_random_states(device: torch.device, states: dict[str, Tensor]) -> None:
+    torch.set_rng_state(states["torch"])
+    if device.type == "cuda":
+        torch.cuda.set_rng_state(states["cuda"], device)
+
+
+def _flushes_denormals() -> bool:
+    return float(torch.full((1,), 1e-40).mul(1.0)) == 0
+
+
+def _keep_freed_memory(keep: bool) -> None:
+    """Has malloc keep memory that a step frees for the next one (glibc; other allocators keep it anyway).
+
+    Handing every large tensor back to the system costs a page fault per 4 KiB, step after step.
+    """
+    if sys.platform != "linux":
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _MMAP_BYTES if keep else _DEFAULT_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES if keep else _DEFAULT_BYTES)
+
+
+def _warn_of_stream_mismatch(warn: bool) -> None:
+    """Torch's warning about gradients that come from another stream, as those of replayed graphs do."""
+    setting: Any = getattr(torch.autograd.graph, "set_warn_on_accumulate_grad_stream_mismatch", None)
+    if setting is not None:
+        setting(warn)

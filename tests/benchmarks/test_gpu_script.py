@@ -1,0 +1,69 @@
+"""A dry run of all stages of benchmarks/gpu.sh, tiny and on the CPU: that they run, and what they leave."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+STAGES = [
+    "install",
+    "build",
+    "parity",
+    "eager",
+    "graphs",
+    "profile",
+    "steps",
+    "render",
+    "train",
+    "eval",
+    "pack",
+]
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="gpu.sh needs bash")
+
+
+def call(output: Path, *options: Any) -> subprocess.CompletedProcess[str]:
+    command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), "--output", str(output), *map(str, options)]
+    environment = os.environ | {"PYTHON": sys.executable, "STEPS": "4", "WILDGS_LPIPS": "off"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280)
+
+
+def test_every_stage_runs_and_leaves_its_result(landmark: Path, tmp_path: Path):
+    done = call(tmp_path, "--dry-run", "--scene", landmark, *STAGES)
+    report = json.loads((tmp_path / "gpu.json").read_text(encoding="utf-8"))
+    codes = {stage["stage"]: stage["exit_code"] for stage in report["stages"]}
+    logs = {path.stem: path.read_text()[-600:] for path in (tmp_path / "parts").glob("*.log")}
+    # Without a GPU pytest selects nothing that it could run, which is its exit code 5, or lists what it would run.
+    assert codes == dict.fromkeys(STAGES[:-1], 0), (done.stdout, logs)
+    assert all(row["well"] for name in ("eager", "graphs") for row in report[name] if "well" in row)
+    assert {(row["method"], row["n"]) for row in report["profile"]} == {
+        (method, n) for method in ("wildgs", "3dgs") for n in (300, 200)
+    }
+    assert [row["method"] for row in report["steps"]] == ["3dgs", "wildgs"]
+    assert report["render"][0]["frames_per_second"] > 0
+    assert report["training"]["step"] == 4
+    assert report["training"]["eval"]["half"]["mean"]["psnr"] > 0
+    with tarfile.open(tmp_path / "gpu.tar.gz") as archive:
+        assert {"gpu.json", "parts/stages.jsonl", "parts/steps.out"} <= set(archive.getnames())
+
+
+def test_earlier_stages_leave_time_to_training(tmp_path: Path):
+    """A budget that is smaller than what training reserves goes to training alone, and every stage says so."""
+    done = call(tmp_path, "--dry-run", "--budget", 100, "build", "eager")
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "parts" / "stages.jsonl").read_text().splitlines()
+    assert [json.loads(line)["exit_code"] for line in lines] == [124, 124]
+
+
+def test_an_unknown_stage_is_named(tmp_path: Path):
+    done = call(tmp_path, "--dry-run", "fly")
+    assert done.returncode == 2
+    assert "unknown stage fly" in done.stderr

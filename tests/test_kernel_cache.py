@@ -1,0 +1,73 @@
+"""Compiled kernels are kept as long as none of the files changes that they may be made of."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from wildgs import kernel_cache
+from wildgs.errors import WildGSWarning
+
+SHARED = """
+from wildgs.kernel_cache import njit
+
+@njit(nogil=True)
+def factor():
+    return {factor}
+"""
+KERNEL = """
+import sys
+from wildgs.kernel_cache import njit
+from {package}.shared import factor
+
+@njit(nogil=True)
+def scaled(x):
+    return x * factor()
+
+print(scaled(21), sum(scaled.stats.cache_hits.values()))
+"""
+
+
+def run(folder: Path) -> list[int]:
+    """The kernel's result in a new process, and how often it came from the cache."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "import kernels.kernel"],
+        capture_output=True, text=True, cwd=folder,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return [int(value) for value in done.stdout.split()]
+
+
+def test_an_edit_of_a_file_that_a_kernel_calls_is_noticed(tmp_path: Path):
+    package = tmp_path / "kernels"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "kernel.py").write_text(KERNEL.format(package="kernels"))
+    (package / "shared.py").write_text(SHARED.format(factor=2))
+    assert run(tmp_path) == [42, 0]
+    assert run(tmp_path) == [42, 1]
+    (package / "shared.py").write_text(SHARED.format(factor=3))
+    assert run(tmp_path) == [63, 0], "old code ran"
+
+
+def test_where_nothing_is_writable_a_temporary_folder_serves_with_one_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    writable = kernel_cache._is_writable
+    monkeypatch.setattr(kernel_cache, "_is_writable", lambda folder: False)
+    kernel_cache.cache_folder.cache_clear()
+    kernel_cache._temporary_folder.cache_clear()
+    try:
+        with pytest.warns(WildGSWarning, match="NUMBA_CACHE_DIR"):
+            first = kernel_cache.cache_folder(tmp_path / "a")
+        assert kernel_cache.cache_folder(tmp_path / "b") == first, (
+            "no second warning, which would be an error"
+        )
+        assert first is not None
+        assert writable(first)
+    finally:
+        kernel_cache.cache_folder.cache_clear()
+        kernel_cache._temporary_folder.cache_clear()
