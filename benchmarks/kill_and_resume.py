@@ -108,6 +108,7 @@ def _leave_after_first_line(output: Path) -> None:
 
 def _child(arguments: list[str], output: Path, stage: str | None, unread: bool) -> None:
     """One training: its output goes to a file, or to a pipe that closes; and it may kill itself."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup, which a training respects
     handle = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(handle, 1)
     os.dup2(handle, 2)

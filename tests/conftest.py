@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,10 @@ from jaxtyping import install_import_hook
 
 # Tests need no network: what is not on disk is not to be had, at once.
 os.environ["HF_HUB_OFFLINE"] = "1"
+
+# Under nohup, and in some runners, processes that tests start would inherit that SIGHUP is ignored.
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 SOURCE = Path(__file__).parent.parent / "src"
 SHARED = Path(__file__).parents[2] / "shared"

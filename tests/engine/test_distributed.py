@@ -29,7 +29,8 @@ def ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder into which two processes wrote what they computed."""
     output = tmp_path_factory.mktemp("ranks")
     launcher = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    environment = os.environ | {"PYTHONPATH": str(SOURCE), "WILDGS_NUM_THREADS": "1"}
+    places = os.pathsep.join([str(SOURCE), str(SOURCE.parent)])  # the package, and helpers of other tests
+    environment = os.environ | {"PYTHONPATH": places, "WILDGS_NUM_THREADS": "1"}
     result = subprocess.run(
         [*launcher, str(SCRIPT), str(output)], env=environment, capture_output=True, text=True, check=False
     )
