@@ -112,12 +112,12 @@ def _child(arguments: list[str], output: Path, stage: str | None, unread: bool) 
     handle = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
+    if unread:
+        _leave_after_first_line(output)
     sys.stdout = open(1, "w", buffering=1, closefd=False)  # noqa: SIM115 - for the process's life
     sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
     from wildgs.cli import main
 
-    if unread:
-        _leave_after_first_line(output)
     if stage is not None:
         _kill_inside(stage, 2)
     main(arguments)
@@ -202,8 +202,9 @@ def _train(
 ) -> float | None:
     """Trains to the end, or kills; seconds of training, or None where it was killed."""
     arguments = ["train", scene, "--output", output, "--method", command.method, "--steps", command.steps]
-    arguments += ["--checkpoint-every", command.every, "--wrapping.resolution", 16, "--parsing.max-side", 32]
-    arguments += ["--parsing.encoder", "nobody/none"]
+    arguments += ["--checkpoint-every", command.every]
+    if command.method == "wildgs":
+        arguments += ["--wrapping.resolution", 16, "--parsing.max-side", 32]
     if (output / "config.yaml").is_file():
         arguments.append("--resume")
     log = output.parent / "output.txt"

@@ -41,7 +41,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 """Options that make a method quick; a method without an entry runs with its defaults."""
 TRAIN = TrainConfig(
-    steps=12,
+    steps=30,
     precision="float32",
     schedule=ScheduleConfig(densify_from=1, densify_every=7500, first_stage=1),
     density=DensityConfig(max_gaussians=1000, grow_gradient=1e-9),

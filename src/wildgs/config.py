@@ -23,6 +23,8 @@ from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 MAX_CONFIG_BYTES = 1_000_000
 
 
+_BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
+"""First and last line: a file that is cut off would be YAML still, and missing entries take their defaults."""
 _MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
 """Entries of earlier versions' `config.yaml` that belong to `ExecutionConfig` now."""
 
@@ -160,7 +162,7 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
 
 
-def _method_of(plain: dict[str, Any]) -> str:
+def _method_of(plain: dict[Any, Any]) -> str:
     return str(plain.get("method", DEFAULT_METHOD))
 
 
@@ -175,7 +177,7 @@ _MOVED_RATES = {
 """From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
 
 
-def _upgraded(plain: dict[str, Any]) -> dict[str, Any]:
+def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
     """A run's configuration as an earlier version wrote it, in today's form.
 
     Learning rates of a method's own parameters were entries of `train.optimizer`, every method carried the default
@@ -239,7 +241,9 @@ def write_config(path: Path, config: RunConfig) -> None:
         UserError: The disk is full, or the folder cannot be written to.
     """
     with written_aside(path, flush=True) as aside, aside.open("w", encoding="utf-8") as file:
+        file.write(f"{_BEGIN}\n")
         yaml.safe_dump(to_plain(config), file, sort_keys=False)
+        file.write(f"{_END}\n")
 
 
 def read_config(path: Path) -> RunConfig:
@@ -251,7 +255,10 @@ def read_config(path: Path) -> RunConfig:
     try:
         if path.stat().st_size > MAX_CONFIG_BYTES:
             raise UserError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is no run's configuration")
-        plain = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        text = path.read_text(encoding="utf-8")
+        if text.startswith(_BEGIN) and _END not in text.splitlines():
+            raise UserError(f"{path} is cut off: the line {_END!r} is missing; restore it from a copy")
+        plain = yaml.load(text, _Loader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # a date that is none: ValueError
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
     for part, name in _MOVED:
@@ -271,6 +278,11 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
     Raises:
         UserError: There is no such entry, or the value is of the wrong type.
     """
+    if isinstance(method := entries.get("method"), str):
+        try:
+            config = config.with_method(method)  # whose options the other entries are
+        except UserError as error:
+            raise UserError(f"{where}.method: {error}") from error
     plain = to_plain(config)
     for path, value in entries.items():
         *parents, name = path.split(".")

@@ -29,7 +29,7 @@ def test_names_of_any_bytes_go_from_training_to_the_report(
     capsys.readouterr().out.encode()
     assert len(list((run / "eval/full").glob("*.png"))) == 1
     loaded = load_run(run)
-    scene = loaded.load_scene()
+    scene = loaded.read_scene()
     assert {view.name for view in scene.views} == set(NAMES)
     page = tmp_path / "report.html"
     write_showcase(page, folder.name, f"{folder}", scene, [("3dgs", loaded, {})])

@@ -225,7 +225,7 @@ def test_a_budget_below_the_points_holds_from_the_start(
     landmark: Path, tmp_path: Path, wildgs, capsys
 ) -> None:
     assert wildgs("train", landmark, "--output", tmp_path / "run", *TRAIN, "--max-gaussians", 100) == 0
-    assert "training starts from 100 of them" in capsys.readouterr().err
+    assert "training starts from 75 of them" in capsys.readouterr().err
     assert load_run(tmp_path / "run").method.num_gaussians <= 100
 
 

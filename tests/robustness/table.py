@@ -61,7 +61,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "names": ("used", "", "used"),
         "read-only": _UNWRITTEN,
         "full disk": _UNWRITTEN,
-        "link loop": ("left out", r"p02\.png \(not a readable picture\)", "left out"),
+        "link loop": ("left out", r"p02\.png \(Too many levels of symbolic links\)", "left out"),
     },
     "COLMAP binary": _MODEL,
     "COLMAP text": _MODEL

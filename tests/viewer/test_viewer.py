@@ -14,6 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.memory_views import make_view
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError
 from wildgs.scene import Scene
@@ -246,7 +247,10 @@ def test_gaussians_that_came_meanwhile_are_shown(trainer_for, wall: Scene) -> No
 def test_a_name_that_is_not_utf8_breaks_nothing(learnt: Trainer, wall: Scene) -> None:
     """Names are bytes; the page is sent as UTF-8."""
     names = ["caf\udce9.jpg", "line\nbreak.jpg", *(view.name for view in wall.views[2:])]
-    views = tuple(replace(view, name=name) for view, name in zip(wall.views, names, strict=True))
+    views = tuple(
+        make_view(name, view.camera, view.split, view.read_photo())
+        for view, name in zip(wall.views, names, strict=True)
+    )
     viewer = open_on(Subject(learnt.method, replace(wall, views=views)))
     work_off(viewer)
     viewer.photos.visit(None, views[0])

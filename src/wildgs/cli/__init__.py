@@ -49,7 +49,8 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     for stream in (sys.stdout, sys.stderr):  # names are bytes, and not all of them are text
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+            with contextlib.suppress(OSError):  # a stream that cannot be set up still shows most names
+                stream.reconfigure(errors="backslashreplace")
     try:
         _dispatch(arguments)
     except ReportedError:

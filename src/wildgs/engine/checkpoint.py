@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import re
@@ -125,6 +126,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
             raise UserError(f"{path} cannot be read ({error}); {_NOT_DAMAGED}") from error
         raise DamagedCheckpointError(f"{path} is damaged ({error}); use another checkpoint") from error
     except (OSError, MemoryError, RuntimeError) as error:  # torch reports missing memory as a RuntimeError
+        if getattr(error, "errno", None) == errno.ELOOP:  # a link to itself has no content to wait for
+            raise DamagedCheckpointError(f"{path} is a link to itself; use another checkpoint") from error
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(f"{path} cannot be read ({reason}); {_NOT_DAMAGED}") from error
 

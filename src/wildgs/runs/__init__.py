@@ -179,9 +179,12 @@ def refuse_trained(folder: Path) -> None:
     """Protects a run from being trained over.
 
     Raises:
-        UserError: The folder already holds one.
+        UserError: The folder already holds one, or its checkpoints have no place.
     """
-    if list_checkpoints(folder / CHECKPOINT_FOLDER):
+    checkpoints = folder / CHECKPOINT_FOLDER
+    if checkpoints.exists() and not checkpoints.is_dir():
+        raise UserError(f"{checkpoints} is not a folder: move it away, or choose another --output")
+    if list_checkpoints(checkpoints):
         raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import is_file
 from wildgs.geometry.camera import Camera
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
@@ -93,7 +94,7 @@ def load_scene(
 def _check_masks(photos: ScenePhotos, views: Sequence[View]) -> None:
     """Warns where there are masks, and none of them belongs to a photo."""
     folder = photos.root / "masks"
-    if not photos.use_masks or not folder.is_dir() or not any(folder.iterdir()):
+    if not photos.use_masks or not folder.is_dir() or not any(is_file(file) for file in folder.rglob("*")):
         return
     if all(photos.find_mask(view.name) is None for view in views):
         warnings.warn(
