@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -102,6 +102,8 @@ class Parsing(MixedModule):
         """
         networks = (self.encoder, self.decoder, self.mask_head, self.global_mlp)
         # The few steps after an opacity reset, in which the mask does not learn, are not worth graphs of their own.
+        function: Callable[..., tuple[Tensor, Tensor]]
+        settings: tuple[Any, ...]
         if self.encoder.frozen:
             packed, shapes = self._frozen_features(photo, name)
             function, image, settings = self._after_frozen, packed, (shapes, learn_mask)
