@@ -74,3 +74,10 @@ def test_a_second_run_on_one_output_is_refused_at_once(photos: Path, tmp_path: P
     with lock_run(tmp_path / "run"), pytest.raises(UserError, match="in use"):
         wildgs.run(photos, tmp_path / "run")
     assert not (tmp_path / "run" / "scene").exists()
+
+
+def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: Path) -> None:
+    Image.fromarray(np.full((8, 8, 3), 200, dtype=np.uint8)).save(photos / "added.jpg")
+    with pytest.raises(UserError, match=r"other photos than .*added\.jpg.*--output"):
+        wildgs.run(photos, scene.parent)
+    assert not (scene.parent / "checkpoints").exists()
