@@ -12,8 +12,13 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+from wildgs.processes import LIBRARY_DEFAULTS
+
 # Tests need no network: what is not on disk is not to be had, at once.
 os.environ["HF_HUB_OFFLINE"] = "1"
+# As the command line does before anything computes: MKL reads its part once, and the first test would decide.
+for _name, _value in LIBRARY_DEFAULTS.items():
+    os.environ.setdefault(_name, _value)
 
 # Under nohup, and in some runners, processes that tests start would inherit that SIGHUP is ignored.
 if hasattr(signal, "SIGHUP"):
