@@ -27,13 +27,16 @@ STAGES = [
     "pack",
 ]
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="gpu.sh needs bash")
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="gpu.sh needs bash"),
+    pytest.mark.timeout(900),
+]
 
 
 def call(output: Path, *options: Any) -> subprocess.CompletedProcess[str]:
     command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), "--output", str(output), *map(str, options)]
     environment = os.environ | {"PYTHON": sys.executable, "STEPS": "4", "WILDGS_LPIPS": "off"}
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=280)
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=800)
 
 
 def test_every_stage_runs_and_leaves_its_result(landmark: Path, tmp_path: Path):

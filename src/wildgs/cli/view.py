@@ -31,6 +31,7 @@ class Command:
 def run(command: Command) -> None:
     """Serves the page until interrupted."""
     import wildgs
+    import wildgs.viewer.serving
 
     with signals_as_interrupts():
         opened = wildgs.view(

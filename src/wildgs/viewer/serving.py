@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
 
 VIDEO_FOLDER = "videos"
+
+# pycolmap sets a SIGTERM handler of its own when it is imported, which localisation does at its first use: here it
+# comes before our handlers, and after what `wildgs.scene` has to load before it.
+import_module("pycolmap")
 
 
 class OpenViewer:
