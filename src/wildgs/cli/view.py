@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,7 +12,7 @@ import tyro
 
 from wildgs.cli.screen import console
 from wildgs.files import printable
-from wildgs.processes import signals_as_interrupts
+from wildgs.processes import TerminatedError, signals_as_interrupts
 from wildgs.viewer.config import ServerConfig, ViewerConfig
 
 
@@ -33,12 +36,17 @@ def run(command: Command) -> None:
     import wildgs
     import wildgs.viewer.serving
 
-    with signals_as_interrupts():
-        opened = wildgs.view(
-            command.run, appearance=command.appearance, server=command.server, viewer=command.viewer
-        )
-        for url in opened.urls:
-            console.print(f"{printable(str(command.run))}: {url}", markup=False)
-        console.print("Ctrl-C ends the viewer")
-        opened.stay()
-    console.print("closed")
+    try:
+        with signals_as_interrupts():
+            opened = wildgs.view(
+                command.run, appearance=command.appearance, server=command.server, viewer=command.viewer
+            )
+            for url in opened.urls:
+                console.print(f"{printable(str(command.run))}: {url}", markup=False)
+            console.print("Ctrl-C ends the viewer")
+            opened.stay()
+        console.print("closed")
+    except TerminatedError as ended:
+        print(ended, file=sys.stderr, flush=True)
+        atexit._run_exitfuncs()  # temporary folders
+        os._exit(ended.code)  # the page is closed; the server's threads may abort the interpreter's own end
