@@ -208,6 +208,8 @@ class WildGSConfig:
         sky: Gaussians that stand for the sky at the start.
         color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
             scene's colours under that are from the photo's. Not in the paper.
+        light_components: Size of the basis of lights in which a photo's light is fitted after the colour match
+            (`wildgs.model.light_basis`); 0 for none. Not in the paper.
         learning_rates: Of networks and intrinsic features.
     """
 
@@ -220,6 +222,7 @@ class WildGSConfig:
     ground: GroundConfig = field(default_factory=GroundConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
+    light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
 

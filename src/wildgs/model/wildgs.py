@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -19,11 +19,13 @@ from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians
 from wildgs.model.lifting import MIN_ALPHA, lift, liftable, random_part
+from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import (
     GEOMETRY_ROWS,
     MemoryUse,
     Method,
     ParameterGroup,
+    SeenPhoto,
     Stage,
     TrainingOutput,
 )
@@ -65,6 +67,7 @@ class WildGS(Method):
         self.parsing = Parsing(config.parsing, encoder)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
+        self.light_basis = LightBasis()
 
     @classmethod
     def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
@@ -99,9 +102,10 @@ class WildGS(Method):
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
         """With a fresh encoder and any box."""
-        return cls(
-            config, gaussians, Box(torch.zeros(3), torch.ones(3)), encoder_of(state, "parsing.encoder.")
-        )
+        box = Box(torch.zeros(3), torch.ones(3))
+        model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
+        model.light_basis.components = state.get("light_basis.components")
+        return model
 
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
@@ -120,8 +124,13 @@ class WildGS(Method):
         ]
 
     def appearance_parameters(self) -> tuple[str, ...]:
-        """The centres, at which planes are sampled, and the fusion network."""
-        return ("fusion.", "gaussians.rows.means")
+        """The centres, at which planes are sampled, the fusion network and the basis of lights."""
+        return ("fusion.", "gaussians.rows.means", "light_basis.")
+
+    @property
+    def basis_size(self) -> int:
+        """Components of the basis of lights."""
+        return 0 if self.light_basis.components is None else len(self.light_basis.components)
 
     def _lacks(self, part: Ablation) -> bool:
         return part in self.config.without
@@ -129,6 +138,21 @@ class WildGS(Method):
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
         """Gives a fresh encoder its normalisation statistics."""
         self.parsing.calibrate(photos)
+
+    @torch.no_grad()
+    def finish(self, photos: Iterable[SeenPhoto], count: int) -> None:
+        """Learns the basis of lights."""
+        self.light_basis.components = None
+        if not self.config.color_match:
+            return
+        most = self.light_basis.affordable_lights(self.num_gaussians, (self.sh_degree + 1) ** 2)
+        chosen = {number * count // most for number in range(most)} if count > most else set(range(count))
+        lights = (
+            self.shade(self.encode(seen.photo, seen.camera, seen.keep, name=seen.name))
+            for number, seen in enumerate(photos)
+            if number in chosen
+        )
+        self.light_basis.learn(lights, self.gaussians, self.config.light_components)
 
     def encode(
         self,
@@ -153,6 +177,7 @@ class WildGS(Method):
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
         if self.config.color_match and trust_mask:
             appearance = self._match(photo, appearance, projection, keep)
+            appearance = self.light_basis.fit(self, photo, appearance, camera, keep)
         return appearance
 
     @torch.no_grad()
@@ -255,10 +280,17 @@ class WildGS(Method):
         means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
-        return Embeddings(appearance.global_embedding, local, appearance.color_map)
+        return Embeddings(appearance.global_embedding, local, appearance.color_map, appearance.basis_weights)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Fuses to spherical harmonics: sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
+        harmonics = self._fused(embeddings, rows)
+        if embeddings.basis_weights is None:
+            return harmonics
+        return harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
+
+    def _fused(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None) -> Float[Tensor, "N K 3"]:
+        """What the networks and the colour match make of embeddings."""
         intrinsic = self.gaussians.rows["intrinsic"]
         if rows is not None:
             intrinsic = take_rows(intrinsic, rows)
