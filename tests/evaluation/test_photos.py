@@ -68,7 +68,8 @@ def test_measures_without_truth_are_those_of_the_tools(half_hidden, shared, tmp_
     """The tools read COLMAP's own observations and the written pictures, with pycolmap, numpy and Pillow alone."""
     scene = write_resized_demo(tmp_path / "scene", photos=9, long_side=160)
     model = WildGSConfig(parsing=ParsingConfig(max_side=32), wrapping=WrappingConfig(resolution=16))
-    run, config = tmp_path / "run", RunConfig(model=model, train=TrainConfig(steps=4, density=DensityConfig(max_gaussians=20_000)))
+    train = TrainConfig(steps=4, density=DensityConfig(max_gaussians=20_000))
+    run, config = tmp_path / "run", RunConfig(model=model, train=train)
     wildgs.train(scene, config, output=run)
     scores = wildgs.evaluate(run)
     full, tools = scores["full"], shared / "tools"

@@ -136,9 +136,7 @@ class LoadedScene:
         """
         return make_path(self.scene, kind, frames=frames, size=size, views=views)
 
-    def photo_fits(
-        self, *, scene: Scene | None = None, progress: Progress | None = None
-    ) -> list[PhotoFit]:
+    def photo_fits(self, *, scene: Scene | None = None, progress: Progress | None = None) -> list[PhotoFit]:
         """How well each training photo fits, and how much of it its mask hides.
 
         Training keeps this in RUN/photos.json at its end; photos of a run without the file are inspected now.
