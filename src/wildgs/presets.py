@@ -38,6 +38,7 @@ _PAPER: dict[str, Any] = {
     "model.sky.points": 0,
     "model.color_match": False,
     "model.light_components": 0,
+    "model.matched_loss": 0.0,
     "train.objective.depth_weight": 0.05,
     "train.schedule.encoder_every": 1,
     "train.density.prune_by_distance": False,

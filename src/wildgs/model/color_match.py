@@ -8,10 +8,13 @@ colours is found in closed form, from one render, and brings most of what many s
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.model.lifting import MIN_ALPHA, liftable
+from wildgs.model.sky import Sky
+from wildgs.rasterize import Rendering
 
 ROUNDS = 6
 RIDGE = 3e-4
@@ -66,6 +69,76 @@ def match_colors(
         Change [A | b]: colours c become ``c + A c + b``. Zero where too little of the scene is seen.
     """
     return _fitted(render, photo, weights, torch.ones_like(weights)[..., None])
+
+
+@torch.no_grad()
+def match_photo(
+    photo: Float[Tensor, "H W 3"],
+    rendering: Rendering,
+    visibility: Float[Tensor, "H W"] | None,
+    keep: Bool[Tensor, "H W"] | None,
+    *,
+    threshold: float,
+    sky: Sky | None,
+    every: int = 1,
+) -> Float[Tensor, "3 M"]:
+    """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
+
+    Photos are full of sky: one change for all would do to the landmark what the sky needs.
+
+    Args:
+        photo: In 0..1.
+        rendering: From the photo's camera.
+        visibility: M; of the sky, all pixels that are covered count.
+        keep: The user's own mask: pixels that are False do not count.
+        threshold: Th: pixels with a visibility above it are static.
+        sky: Which pixels show it; None matches all pixels alike.
+        every: Only every so many rows and columns are read.
+
+    Returns:
+        As `match_colors`; with a sky, that of `match_sky` beside it.
+    """
+    static = liftable(visibility, rendering.alpha, threshold)
+    covered = rendering.alpha > MIN_ALPHA
+    if keep is not None:
+        static, covered = static & keep, covered & keep
+    weights = static.float() if visibility is None else visibility * static
+    some = (slice(every // 2, None, every),) * 2
+    colors, photo, weights = rendering.colors[some], photo[some], weights[some]
+    if sky is None:
+        return match_colors(colors, photo, weights)
+    own = match_colors(colors, photo, weights * ~sky.which[some])
+    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some])
+    return torch.cat([own, of_sky], dim=1)
+
+
+def changed_harmonics(
+    harmonics: Float[Tensor, "V K 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+) -> Float[Tensor, "V K 3"]:
+    """The harmonics of changed colours.
+
+    Args:
+        harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
+        change: From `match_photo`.
+        sky: Which Gaussians stand for it; None as in `match_photo`.
+    """
+    if sky is None:
+        return mapped(harmonics, change)
+    own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+    above = mapped(harmonics, of_sky, elevation_powers(sky.sine) @ by_elevation.T)
+    return torch.where(sky.which[:, None, None], above, mapped(harmonics, own))
+
+
+def changed_picture(
+    render: Float[Tensor, "H W 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+) -> Float[Tensor, "H W 3"]:
+    """A render of changed colours, pixel by pixel; see `changed_harmonics`."""
+    own = render + render @ change[:, :3].T + change[:, 3]
+    if sky is None:
+        return own
+    _, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+    above = render + render @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
+    return torch.where(sky.which[..., None], above, own)
 
 
 @torch.no_grad()

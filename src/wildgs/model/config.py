@@ -208,6 +208,8 @@ class WildGSConfig:
         sky: Gaussians that stand for the sky at the start.
         color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
             scene's colours under that are from the photo's. Not in the paper.
+        matched_loss: How much of the colour match a training render gets before it is compared with its photo, from
+            0 to 1. Not in the paper.
         light_components: Size of the basis of lights in which a photo's light is fitted after the colour match
             (`wildgs.model.light_basis`); 0 for none. Not in the paper.
         learning_rates: Of networks and intrinsic features.
@@ -222,6 +224,7 @@ class WildGSConfig:
     ground: GroundConfig = field(default_factory=GroundConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
+    matched_loss: float = 1.0
     light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 

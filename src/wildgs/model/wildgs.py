@@ -12,13 +12,13 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import elevation_powers, mapped, match_colors, match_sky
+from wildgs.model.color_match import changed_harmonics, changed_picture, match_photo
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.lifting import MIN_ALPHA, lift, liftable, random_part
+from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import (
     GEOMETRY_ROWS,
@@ -31,9 +31,13 @@ from wildgs.model.method import (
 )
 from wildgs.model.parsing import Parsing
 from wildgs.model.rows import paint_visible, take_rows
+from wildgs.model.sky import Sky, find_sky
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping
-from wildgs.rasterize import Projection, blend
+from wildgs.rasterize import Projection, Rendering, blend
+
+MATCH_EVERY = 3
+"""In training, the colour match reads every third row and column."""
 
 
 class WildGS(Method):
@@ -188,39 +192,16 @@ class WildGS(Method):
         projection: Projection,
         keep: Bool[Tensor, "H W"] | None,
     ) -> Appearance:
-        """Adds what the appearance's own render of the photo is off by, for the landmark and the sky apart.
+        """Adds what the appearance's own render of the photo is off by."""
+        rendering = blend(projection, paint_visible(self, projection, appearance, self.sh_degree))
+        sky = self._find_sky(projection.camera.unproject(rendering.depth))
+        change = match_photo(
+            photo, rendering, appearance.visibility, keep, threshold=self.mask_threshold, sky=sky
+        )
+        return replace(appearance, color_map=change)
 
-        Photos are full of sky: one change for all would do to the landmark what the sky needs.
-        """
-        colors = paint_visible(self, projection, appearance, self.sh_degree)
-        rendering = blend(projection, colors)
-        static = liftable(appearance.visibility, rendering.alpha, self.mask_threshold)
-        if keep is not None:
-            static = static & keep
-        weights = static.float() if appearance.visibility is None else appearance.visibility * static
-        if not self.config.sky.points:
-            return replace(appearance, color_map=match_colors(rendering.colors, photo, weights))
-        sky = rendering.depth > self._sky_distance
-        covered = (rendering.alpha > MIN_ALPHA) & sky
-        if keep is not None:
-            covered = covered & keep
-        _, sine = self._seen_from_centre(projection.camera.unproject(rendering.depth))
-        own = match_colors(rendering.colors, photo, weights * ~sky)
-        of_sky = match_sky(rendering.colors, photo, covered.float(), sine)
-        return replace(appearance, color_map=torch.cat([own, of_sky], dim=1))
-
-    @property
-    def _sky_distance(self) -> float:
-        """Half of the shell's radius: what is further away, as a Gaussian or a rendered depth, counts as sky."""
-        return 0.5 * self.config.sky.radius
-
-    def _seen_from_centre(
-        self, points: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Distances of points from the centre of the triplane, and sines of their elevations."""
-        offsets = points - (self.wrapping.low + self.wrapping.high) / 2
-        distances = offsets.norm(dim=-1)
-        return distances, offsets[..., 2] / distances.clamp_min(1e-6)
+    def _find_sky(self, points: Float[Tensor, "*batch 3"]) -> Sky | None:
+        return find_sky(self.config.sky, points.detach(), (self.wrapping.low + self.wrapping.high) / 2)
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
         """M, by 2D Parsing alone."""
@@ -303,12 +284,9 @@ class WildGS(Method):
         )
         if change is None or change.shape[1] == 4:
             return self.fusion(common, local, intrinsic, change)
-        harmonics = self.fusion(common, local, intrinsic)
-        own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
-        means = self.gaussians.means.detach()
-        distance, sine = self._seen_from_centre(means if rows is None else means[rows])
-        sky = mapped(harmonics, of_sky, elevation_powers(sine) @ by_elevation.T)
-        return torch.where((distance > self._sky_distance)[:, None, None], sky, mapped(harmonics, own))
+        means = self.gaussians.means
+        sky = self._find_sky(means if rows is None else means[rows])
+        return changed_harmonics(self.fusion(common, local, intrinsic), change, sky)
 
     def training_pass(
         self,
@@ -328,4 +306,23 @@ class WildGS(Method):
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
-        return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
+        rendering = blend(projection, colors)
+        if self.config.color_match and self.config.matched_loss:
+            rendering = self._matched(photo, rendering, appearance.visibility, camera, keep)
+        return TrainingOutput(rendering, projection, appearance.visibility)
+
+    def _matched(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        rendering: Rendering,
+        visibility: Float[Tensor, "H W"] | None,
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None,
+    ) -> Rendering:
+        """The render as `encode`'s colour match would leave it; no gradient reaches the match itself."""
+        with torch.no_grad():
+            sky = self._find_sky(camera.unproject(rendering.depth))
+            change = self.config.matched_loss * match_photo(
+                photo, rendering, visibility, keep, threshold=self.mask_threshold, sky=sky, every=MATCH_EVERY
+            )
+        return replace(rendering, colors=changed_picture(rendering.colors, change, sky))
