@@ -36,6 +36,7 @@ _PAPER: dict[str, Any] = {
     "model.wrapping.partial_lifts": 0.0,
     "model.ground.points": 0,
     "model.sky.points": 0,
+    "model.sky.densify": True,
     "model.color_match": False,
     "model.light_components": 0,
     "model.matched_loss": 0.0,

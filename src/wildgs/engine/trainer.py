@@ -231,7 +231,11 @@ class Trainer:
         if self.schedule.densifies(self.step, taken):
             large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
-                self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
+                self.method.gaussians,
+                self.optimizers.rows,
+                self.generator,
+                prune_large=large,
+                growable=self.method.growable(),
             )
             if report.cloned or report.split or report.pruned:
                 sort_rows(self.method.gaussians, self.optimizers.rows)

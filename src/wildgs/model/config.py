@@ -133,6 +133,8 @@ class SkyConfig:
         lowest: Elevation at which the shell ends, degrees. Below the horizon it closes the scene behind ground that
             too few photos show: such holes are as dark as the background otherwise.
         opacity: Of its Gaussians at the start.
+        densify: Whether its Gaussians are cloned and split as others are: clouds, which no two photos share, then
+            take up to half of the budget.
     """
 
     points: int = 5000
@@ -140,6 +142,7 @@ class SkyConfig:
     reach: float = 2.0
     lowest: float = -90.0
     opacity: float = 0.5
+    densify: bool = False
 
 
 @dataclass(frozen=True)

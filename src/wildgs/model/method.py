@@ -207,6 +207,10 @@ class Method(nn.Module, ABC):
         """N."""
         return len(self.gaussians)
 
+    def growable(self) -> Bool[Tensor, " N"] | None:
+        """Which Gaussians densification may clone and split; None for all."""
+        return None
+
     # Encode, shade, render.
 
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:

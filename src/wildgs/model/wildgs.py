@@ -111,6 +111,11 @@ class WildGS(Method):
         model.light_basis.components = state.get("light_basis.components")
         return model
 
+    def growable(self) -> Bool[Tensor, " N"] | None:
+        """All but the sky, unless configured."""
+        sky = None if self.config.sky.densify else self._find_sky(self.gaussians.means)
+        return None if sky is None else ~sky.which
+
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
         rates = self.config.learning_rates
