@@ -36,9 +36,6 @@ from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping
 from wildgs.rasterize import Projection, Rendering, blend
 
-MATCH_EVERY = 3
-"""In training, the colour match reads every third row and column."""
-
 
 class WildGS(Method):
     """Gaussians whose colours are fused from a photo's global light, its local light, and their own nature."""
@@ -328,6 +325,6 @@ class WildGS(Method):
         with torch.no_grad():
             sky = self._find_sky(camera.unproject(rendering.depth))
             change = self.config.matched_loss * match_photo(
-                photo, rendering, visibility, keep, threshold=self.mask_threshold, sky=sky, every=MATCH_EVERY
+                photo, rendering, visibility, keep, threshold=self.mask_threshold, sky=sky, training=True
             )
         return replace(rendering, colors=changed_picture(rendering.colors, change, sky))
