@@ -101,3 +101,20 @@ def test_a_changed_picture_is_the_picture_of_changed_harmonics() -> None:
     expected = (C0 * changed_harmonics(flat, change, rows) + 0.5).reshape(colors.shape)
     torch.testing.assert_close(changed_picture(colors, change, sky), expected)
     torch.testing.assert_close(changed_picture(colors, change[:, :4], None), changed(colors, change[:, :4]))
+
+
+def test_in_training_channels_do_not_mix() -> None:
+    """However little a render's hue says about the photo's, the match must not take it away."""
+    generator = torch.Generator().manual_seed(0)
+    grey = torch.rand(24, 30, 1, generator=generator)
+    render = grey + 0.05 * torch.randn(24, 30, 3, generator=generator)
+    photo = torch.tensor([0.8, 1.0, 0.6]) * grey.expand(24, 30, 3) + 0.1
+    weights, sine = torch.ones(24, 30), torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
+    for found in (match_colors(render, photo, weights, True), match_sky(render, photo, weights, sine, True)):
+        off_diagonal = ~torch.eye(3, dtype=torch.bool)
+        assert not found[:, :3][off_diagonal].any()
+        assert float((changed(render, found[:, :4]) - photo).abs().mean()) < 0.06
+    free = match_colors(render, photo, weights)
+    hue = torch.tensor([1.0, -1.0, 0.0])
+    kept = (hue + free[:, :3] @ hue).norm() / hue.norm()
+    assert float(kept) < 0.5, "the full map does take it away"

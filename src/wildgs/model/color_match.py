@@ -25,7 +25,7 @@ OUTLIER = 0.05
 LEAST_PIXELS = 64
 """Fewer say nothing about a photo's light."""
 MATCH_EVERY = 3
-
+"""Rows and columns of which one is read in training."""
 
 ELEVATION_ORDERS = 2
 """Powers of the sine of the elevation by which the sky's colours are matched: it is paler near the horizon."""
@@ -61,7 +61,7 @@ def match_colors(
     render: Float[Tensor, "H W 3"],
     photo: Float[Tensor, "H W 3"],
     weights: Float[Tensor, "H W"],
-    rounds: int = ROUNDS,
+    training: bool = False,
 ) -> Float[Tensor, "3 4"]:
     """The affine map of colours that takes a render to its photo, by robust least squares.
 
@@ -69,12 +69,12 @@ def match_colors(
         render: In 0..1, more where the scene is brighter than white.
         photo: In 0..1.
         weights: Of the pixels, 0 or more; 0 where something stands in the way.
-        rounds: Of reweighting.
+        training: Whether each channel has a gain of its own and no share in the others.
 
     Returns:
         Change [A | b]: colours c become ``c + A c + b``. Zero where too little of the scene is seen.
     """
-    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None], rounds)
+    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None], training)
 
 
 @torch.no_grad()
@@ -99,7 +99,7 @@ def match_photo(
         keep: The user's own mask: pixels that are False do not count.
         threshold: Th: pixels with a visibility above it are static.
         sky: Which pixels show it; None matches all pixels alike.
-        training: Reads every third row and column, in fewer rounds.
+        training: Reads every third row and column, and gives each channel a gain of its own, no more.
 
     Returns:
         As `match_colors`; with a sky, that of `match_sky` beside it.
@@ -110,12 +110,11 @@ def match_photo(
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
     some = (slice(MATCH_EVERY // 2, None, MATCH_EVERY) if training else slice(None),) * 2
-    rounds = TRAINING_ROUNDS if training else ROUNDS
     colors, photo, weights = rendering.colors[some], photo[some], weights[some]
     if sky is None:
-        return match_colors(colors, photo, weights, rounds)
-    own = match_colors(colors, photo, weights * ~sky.which[some], rounds)
-    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], rounds)
+        return match_colors(colors, photo, weights, training)
+    own = match_colors(colors, photo, weights * ~sky.which[some], training)
+    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], training)
     return torch.cat([own, of_sky], dim=1)
 
 
@@ -154,7 +153,7 @@ def match_sky(
     photo: Float[Tensor, "H W 3"],
     weights: Float[Tensor, "H W"],
     sine: Float[Tensor, "H W"],
-    rounds: int = ROUNDS,
+    training: bool = False,
 ) -> Float[Tensor, "3 M"]:
     """As `match_colors`, for the sky: the change may vary smoothly with the elevation.
 
@@ -163,34 +162,43 @@ def match_sky(
         photo: In 0..1.
         weights: Of the pixels; 0 where there is no sky.
         sine: Of the elevation at which a pixel shows the sky.
-        rounds: Of reweighting.
+        training: Whether each channel has a gain of its own and no share in the others.
 
     Returns:
         Change [A | b | E]: colours c become ``c + A c + b + E @ elevation_powers(sine)``.
     """
     further = torch.cat([torch.ones_like(sine)[..., None], elevation_powers(sine)], dim=-1)
-    return _fitted(render, photo, weights, further, rounds)
+    return _fitted(render, photo, weights, further, training)
 
 
 def _fitted(
-    render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"], rounds: int
-) -> Tensor:
+    render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"], training: bool
+) -> Float[Tensor, "3 M"]:
     """Robust least squares of the photo's difference from the render by the render's colours and further terms.
+
+    In training each channel has a gain of its own and no share in the others. With all nine numbers, training lost
+    the colours of materials: errors of the render weaken what the fit makes of a hue, which then is not learnt.
 
     Nothing in it waits for a GPU: pixels that do not count are weighted, not selected.
     """
-    counts = (weights > 0).reshape(-1, 1)
-    base = torch.where(counts, weights.reshape(-1, 1), 0).double()
-    colors = torch.where(counts, render.reshape(-1, 3).clamp(0, 1), 0).double()
-    residual = torch.where(counts, photo.reshape(-1, 3), 0).double() - colors
-    terms = torch.cat([colors, further.reshape(len(colors), -1).double()], dim=1)
-    columns = terms.shape[1]
-    ridge = RIDGE * torch.eye(columns, dtype=terms.dtype, device=terms.device)
-    change, trusted = terms.new_zeros(columns, 3), base
-    for _ in range(rounds):
-        weighted = terms * (trusted / trusted.sum())
-        change = torch.linalg.solve_ex(weighted.T @ terms + ridge, weighted.T @ residual).result
-        error = (residual - terms @ change).abs().mean(dim=1, keepdim=True)
+    counts = (weights > 0).reshape(-1)
+    base = torch.where(counts, weights.reshape(-1), 0).double()
+    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(0, 1), 0).double()
+    residual = torch.where(counts[:, None], photo.reshape(-1, 3), 0).double() - colors
+    further = further.reshape(len(colors), -1).double()
+    # A leading axis of problems: one of three channels, or one for each channel.
+    if training:
+        terms = torch.cat([colors.T[..., None], further.expand(3, -1, -1)], dim=2)
+        residual = residual.T[..., None]
+    else:
+        terms, residual = torch.cat([colors, further], dim=1)[None], residual[None]
+    ridge = RIDGE * torch.eye(terms.shape[2], dtype=terms.dtype, device=terms.device)
+    change, trusted = terms.new_zeros(()), base
+    for _ in range(TRAINING_ROUNDS if training else ROUNDS):
+        weighted = terms.mT * (trusted / trusted.sum())
+        change = torch.linalg.solve_ex(weighted @ terms + ridge, weighted @ residual).result
+        error = (residual - terms @ change).abs().mean(dim=(0, 2))
         trusted = base * OUTLIER**2 / (OUTLIER**2 + error.square())
-    usable = change.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
-    return torch.where(usable, change.T.float(), 0).contiguous()
+    found = torch.cat([change[:, 0, 0].diag(), change[:, 1:, 0]], dim=1) if training else change[0].T
+    usable = found.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
+    return torch.where(usable, found.float(), 0).contiguous()
