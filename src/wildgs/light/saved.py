@@ -20,6 +20,8 @@ from wildgs.model.method import Method
 
 SUFFIX = ".safetensors"
 FORMAT = "wildgs-appearance-2"
+SKY = "sky."
+"""Prefix of the tensors of the look whose sky is shown."""
 
 
 def save_look(look: Look, file: Path) -> Path:
@@ -37,6 +39,8 @@ def save_look(look: Look, file: Path) -> Path:
     if file.suffix != SUFFIX:
         raise UserError(f"{file}: appearance files end in {SUFFIX}")
     tensors = _packed(look.embeddings)
+    if look.sky is not None:
+        tensors |= {f"{SKY}{name}": values for name, values in _packed(look.sky.embeddings).items()}
     header = {
         "format": FORMAT,
         "name": look.name,
@@ -67,7 +71,9 @@ def load_look(method: Method, file: Path) -> Look:
                 f"{file}: was made with another run, or another step of this one; make it anew with "
                 "`wildgs appearance`"
             )
-        return Look(name, _fitting(method, tensors), method)
+        of_sky = {key.removeprefix(SKY): values for key, values in tensors.items() if key.startswith(SKY)}
+        sky = Look(f"sky of {name}", _fitting(method, of_sky), method) if of_sky else None
+        return Look(name, _fitting(method, tensors), method, sky=sky)
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
 

@@ -207,6 +207,10 @@ class Method(nn.Module, ABC):
         """N."""
         return len(self.gaussians)
 
+    def sky(self) -> Bool[Tensor, " N"] | None:
+        """Which Gaussians stand for the sky; None where the method does not tell."""
+        return None
+
     def growable(self) -> Bool[Tensor, " N"] | None:
         """Which Gaussians densification may clone and split; None for all."""
         return None

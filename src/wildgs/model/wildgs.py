@@ -110,8 +110,13 @@ class WildGS(Method):
 
     def growable(self) -> Bool[Tensor, " N"] | None:
         """All but the sky, unless configured."""
-        sky = None if self.config.sky.densify else self._find_sky(self.gaussians.means)
-        return None if sky is None else ~sky.which
+        sky = None if self.config.sky.densify else self.sky()
+        return None if sky is None else ~sky
+
+    def sky(self) -> Bool[Tensor, " N"] | None:
+        """Those far from the scene; see `wildgs.model.sky.find_sky`."""
+        sky = self._find_sky(self.gaussians.means)
+        return None if sky is None else sky.which
 
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
