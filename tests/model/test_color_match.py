@@ -93,14 +93,29 @@ def test_mapped_harmonics_are_those_of_mapped_colours() -> None:
 def test_a_changed_picture_is_the_picture_of_changed_harmonics() -> None:
     generator = torch.Generator().manual_seed(0)
     colors = torch.rand(24, 30, 3, generator=generator)
+    codes = torch.rand(24, 30, 2, generator=generator)
     sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
     sky = Sky(sine > 0.4, sine)
-    change = 0.2 * (torch.rand(3, 4 + SKY_COLUMNS, generator=generator) - 0.5)
+    change = 0.2 * (torch.rand(3, 6 + SKY_COLUMNS, generator=generator) - 0.5)
     flat = ((colors - 0.5) / C0).reshape(-1, 1, 3)
     rows = Sky(sky.which.reshape(-1), sky.sine.reshape(-1))
-    expected = (C0 * changed_harmonics(flat, change, rows) + 0.5).reshape(colors.shape)
-    torch.testing.assert_close(changed_picture(colors, change, sky), expected)
-    torch.testing.assert_close(changed_picture(colors, change[:, :4], None), changed(colors, change[:, :4]))
+    for of_picture, of_rows in ((sky, rows), (None, None)):
+        harmonics = changed_harmonics(flat, change, of_rows, codes.reshape(-1, 2))
+        expected = (C0 * harmonics + 0.5).reshape(colors.shape)
+        torch.testing.assert_close(changed_picture(colors, change, of_picture, codes), expected)
+    expected = changed(colors, change[:, :4]) + codes @ change[:, 4:6].T
+    torch.testing.assert_close(changed_picture(colors, change, None, codes), expected)
+
+
+def test_light_that_follows_the_codes_is_found() -> None:
+    """Sun on one side of the scene, shade on the other: the codes say which side is which."""
+    generator = torch.Generator().manual_seed(0)
+    render, codes = torch.rand(24, 30, 3, generator=generator), torch.zeros(24, 30, 1)
+    codes[:, :15] = 1
+    photo = 0.8 * render + 0.15 * codes
+    for training in (False, True):
+        found = match_colors(render, photo, torch.ones(24, 30), training, codes)
+        torch.testing.assert_close(changed_picture(render, found, None, codes), photo, atol=0.01, rtol=0)
 
 
 def test_in_training_channels_do_not_mix() -> None:

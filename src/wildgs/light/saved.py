@@ -15,7 +15,6 @@ from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
-from wildgs.model.color_match import SKY_COLUMNS
 from wildgs.model.method import Method
 
 SUFFIX = ".safetensors"
@@ -110,7 +109,7 @@ def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
     if common.shape != (method.global_size,):
         raise ValueError("embeddings of another length")
-    if color_map.shape not in ((3, 4), (3, 4 + SKY_COLUMNS)):
+    if color_map.shape not in ((3, 4), (3, method.map_columns)):
         raise ValueError("a colour map of another shape")
     weights = tensors.get("basis_weights")
     if weights is not None and weights.shape != (method.basis_size,):

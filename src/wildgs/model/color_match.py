@@ -62,7 +62,8 @@ def match_colors(
     photo: Float[Tensor, "H W 3"],
     weights: Float[Tensor, "H W"],
     training: bool = False,
-) -> Float[Tensor, "3 4"]:
+    codes: Float[Tensor, "H W L"] | None = None,
+) -> Float[Tensor, "3 M"]:
     """The affine map of colours that takes a render to its photo, by robust least squares.
 
     Args:
@@ -70,11 +71,15 @@ def match_colors(
         photo: In 0..1.
         weights: Of the pixels, 0 or more; 0 where something stands in the way.
         training: Whether each channel has a gain of its own and no share in the others.
+        codes: Further terms; None for none.
 
     Returns:
-        Change [A | b]: colours c become ``c + A c + b``. Zero where too little of the scene is seen.
+        Change [A | b | W]: colours c become ``c + A c + b + W codes``. Zero where too little of the scene is seen.
     """
-    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None], training)
+    further = torch.ones_like(weights)[..., None]
+    if codes is not None:
+        further = torch.cat([further, codes], dim=2)
+    return _fitted(render, photo, weights, further, training)
 
 
 @torch.no_grad()
@@ -86,6 +91,7 @@ def match_photo(
     *,
     threshold: float,
     sky: Sky | None,
+    codes: Float[Tensor, "H W L"],
     training: bool = False,
 ) -> Float[Tensor, "3 M"]:
     """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
@@ -99,10 +105,11 @@ def match_photo(
         keep: The user's own mask: pixels that are False do not count.
         threshold: Th: pixels with a visibility above it are static.
         sky: Which pixels show it; None matches all pixels alike.
+        codes: Rendered light codes of the landmark, on which its change depends linearly; L may be 0.
         training: Reads every third row and column, and gives each channel a gain of its own, no more.
 
     Returns:
-        As `match_colors`; with a sky, that of `match_sky` beside it.
+        As `match_colors`, [A | b | W]; with a sky, that of `match_sky` beside it.
     """
     static = liftable(visibility, rendering.alpha, threshold)
     covered = rendering.alpha > MIN_ALPHA
@@ -112,14 +119,17 @@ def match_photo(
     some = (slice(MATCH_EVERY // 2, None, MATCH_EVERY) if training else slice(None),) * 2
     colors, photo, weights = rendering.colors[some], photo[some], weights[some]
     if sky is None:
-        return match_colors(colors, photo, weights, training)
-    own = match_colors(colors, photo, weights * ~sky.which[some], training)
+        return match_colors(colors, photo, weights, training, codes[some])
+    own = match_colors(colors, photo, weights * ~sky.which[some], training, codes[some])
     of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], training)
     return torch.cat([own, of_sky], dim=1)
 
 
 def changed_harmonics(
-    harmonics: Float[Tensor, "V K 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+    harmonics: Float[Tensor, "V K 3"],
+    change: Float[Tensor, "3 M"],
+    sky: Sky | None,
+    codes: Float[Tensor, "V L"],
 ) -> Float[Tensor, "V K 3"]:
     """The harmonics of changed colours.
 
@@ -127,24 +137,34 @@ def changed_harmonics(
         harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
         change: From `match_photo`.
         sky: Which Gaussians stand for it; None as in `match_photo`.
+        codes: Their light codes.
     """
+    own, by_code, of_sky, by_elevation = _split(change, codes.shape[1])
+    below = mapped(harmonics, own, codes @ by_code.T)
     if sky is None:
-        return mapped(harmonics, change)
-    own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+        return below
     above = mapped(harmonics, of_sky, elevation_powers(sky.sine) @ by_elevation.T)
-    return torch.where(sky.which[:, None, None], above, mapped(harmonics, own))
+    return torch.where(sky.which[:, None, None], above, below)
 
 
 def changed_picture(
-    render: Float[Tensor, "H W 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+    render: Float[Tensor, "H W 3"],
+    change: Float[Tensor, "3 M"],
+    sky: Sky | None,
+    codes: Float[Tensor, "H W L"],
 ) -> Float[Tensor, "H W 3"]:
     """A render of changed colours, pixel by pixel; see `changed_harmonics`."""
-    own = render + render @ change[:, :3].T + change[:, 3]
+    own, by_code, of_sky, by_elevation = _split(change, codes.shape[2])
+    below = render + render @ own[:, :3].T + own[:, 3] + codes @ by_code.T
     if sky is None:
-        return own
-    _, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+        return below
     above = render + render @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
-    return torch.where(sky.which[..., None], above, own)
+    return torch.where(sky.which[..., None], above, below)
+
+
+def _split(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
+    """[A | b] of the landmark and what its codes change, the same of the sky and its elevation."""
+    return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)
 
 
 @torch.no_grad()

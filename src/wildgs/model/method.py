@@ -143,6 +143,11 @@ class Method(nn.Module, ABC):
     depth_supervised: bool = False
 
     @property
+    def map_columns(self) -> int:
+        """Columns of a colour map."""
+        return 4
+
+    @property
     def basis_size(self) -> int:
         """Number of basis weights of an appearance; 0 for a method that fits none."""
         return 0

@@ -8,11 +8,11 @@ from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import changed_harmonics, changed_picture, match_photo
+from wildgs.model.color_match import SKY_COLUMNS, changed_harmonics, changed_picture, match_photo
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
@@ -69,6 +69,9 @@ class WildGS(Method):
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
         self.light_basis = LightBasis()
+        self.light_codes = None
+        if config.light_codes and not self._lacks("intrinsic"):
+            self.light_codes = nn.Linear(config.fusion.intrinsic_size, config.light_codes, bias=False)
 
     @classmethod
     def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
@@ -105,6 +108,8 @@ class WildGS(Method):
         """With a fresh encoder and any box."""
         box = Box(torch.zeros(3), torch.ones(3))
         model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
+        if "light_codes.weight" not in state:  # of an earlier version
+            model.light_codes = None
         model.light_basis.components = state.get("light_basis.components")
         return model
 
@@ -136,7 +141,13 @@ class WildGS(Method):
 
     def appearance_parameters(self) -> tuple[str, ...]:
         """The centres, at which planes are sampled, the fusion network and the basis of lights."""
-        return ("fusion.", "gaussians.rows.means", "light_basis.")
+        return ("fusion.", "gaussians.rows.means", "light_basis.", "light_codes.")
+
+    @property
+    def map_columns(self) -> int:
+        """[A | b] and the light codes' of the landmark, and the sky's."""
+        codes = 0 if self.light_codes is None else self.light_codes.out_features
+        return 4 + codes + (SKY_COLUMNS if self.config.sky.points else 0)
 
     @property
     def basis_size(self) -> int:
@@ -200,10 +211,17 @@ class WildGS(Method):
         keep: Bool[Tensor, "H W"] | None,
     ) -> Appearance:
         """Adds what the appearance's own render of the photo is off by."""
-        rendering = blend(projection, paint_visible(self, projection, appearance, self.sh_degree))
+        colors = paint_visible(self, projection, appearance, self.sh_degree)
+        rendering, codes = self._blend_with_codes(projection, colors)
         sky = self._find_sky(projection.camera.unproject(rendering.depth))
         change = match_photo(
-            photo, rendering, appearance.visibility, keep, threshold=self.mask_threshold, sky=sky
+            photo,
+            rendering,
+            appearance.visibility,
+            keep,
+            threshold=self.mask_threshold,
+            sky=sky,
+            codes=codes,
         )
         return replace(appearance, color_map=change)
 
@@ -293,7 +311,21 @@ class WildGS(Method):
             return self.fusion(common, local, intrinsic, change)
         means = self.gaussians.means
         sky = self._find_sky(means if rows is None else means[rows])
-        return changed_harmonics(self.fusion(common, local, intrinsic), change, sky)
+        return changed_harmonics(self.fusion(common, local, intrinsic), change, sky, self._codes(rows))
+
+    def _codes(self, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N L"]:
+        """Light codes: what a photo's change of colours may depend on, from Gaussian to Gaussian."""
+        intrinsic = self.gaussians.rows["intrinsic"]
+        if rows is not None:
+            intrinsic = take_rows(intrinsic, rows)
+        return intrinsic[:, :0] if self.light_codes is None else self.light_codes(intrinsic)
+
+    def _blend_with_codes(
+        self, projection: Projection, colors: Float[Tensor, "N 3"]
+    ) -> tuple[Rendering, Float[Tensor, "H W L"]]:
+        """A rendering, and the light codes in its pixels."""
+        rendering = blend(projection, torch.cat([colors, self._codes()], dim=1))
+        return replace(rendering, colors=rendering.colors[..., :3]), rendering.colors[..., 3:]
 
     def training_pass(
         self,
@@ -313,15 +345,17 @@ class WildGS(Method):
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
-        rendering = blend(projection, colors)
-        if self.config.color_match and self.config.matched_loss:
-            rendering = self._matched(photo, rendering, appearance.visibility, camera, keep)
+        if not (self.config.color_match and self.config.matched_loss):
+            return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
+        rendering, codes = self._blend_with_codes(projection, colors)
+        rendering = self._matched(photo, rendering, codes, appearance.visibility, camera, keep)
         return TrainingOutput(rendering, projection, appearance.visibility)
 
     def _matched(
         self,
         photo: Float[Tensor, "H W 3"],
         rendering: Rendering,
+        codes: Float[Tensor, "H W L"],
         visibility: Float[Tensor, "H W"] | None,
         camera: Camera,
         keep: Bool[Tensor, "H W"] | None,
@@ -330,6 +364,13 @@ class WildGS(Method):
         with torch.no_grad():
             sky = self._find_sky(camera.unproject(rendering.depth))
             change = self.config.matched_loss * match_photo(
-                photo, rendering, visibility, keep, threshold=self.mask_threshold, sky=sky, training=True
+                photo,
+                rendering,
+                visibility,
+                keep,
+                threshold=self.mask_threshold,
+                sky=sky,
+                codes=codes,
+                training=True,
             )
-        return replace(rendering, colors=changed_picture(rendering.colors, change, sky))
+        return replace(rendering, colors=changed_picture(rendering.colors, change, sky, codes))
