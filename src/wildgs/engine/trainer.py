@@ -24,7 +24,7 @@ from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
 from wildgs.model.feature_cache import FeatureCache
-from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.method import Method, SeenPhoto, TrainingOutput
 from wildgs.model.parsing import keep_features
 from wildgs.model.precision import (
     choose_precision,
@@ -140,9 +140,11 @@ class Trainer:
             self.begin()
             while self.step < self.config.steps:
                 report = self.advance()
+                if self.step >= self.config.steps:
+                    self._settle()
+                    self._finish()
                 for observer in observers:
                     observer(report)
-            self._settle()
         finally:
             self.end()
 
@@ -256,14 +258,24 @@ class Trainer:
         if self.schedule.densifies(self.step, taken):
             large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
-                self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large, sort=True
+                self.method.gaussians,
+                self.optimizers.rows,
+                self.generator,
+                prune_large=large,
+                growable=self.method.growable(),
+                sort=True,
             )
         return report
 
     def shrink_to_budget(self) -> int:
         """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
         budget = self.config.density.max_gaussians
-        return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+        excess = self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+        if excess:
+            self.method.finish((), 0)
+            if self.step >= self.config.steps:
+                self._finish()
+        return excess
 
     def _prepare(self) -> None:
         """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
@@ -271,6 +283,18 @@ class Trainer:
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
+
+    def _finish(self) -> None:
+        """Shows the method the training photos once more."""
+        start = time.perf_counter()
+        switch_replays(self.method, False)
+        readable = [view for view in self.views if self.feed.is_readable(view)]
+        self.method.finish(map(self._seen, readable), len(readable))
+        self.seconds += time.perf_counter() - start
+
+    def _seen(self, view: View) -> SeenPhoto:
+        photo, keep = self.feed.photo(view)
+        return SeenPhoto(photo, self.feed.camera(view), keep, view.name)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to go on exactly, as flat tensors."""
@@ -297,6 +321,8 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
+        if self.step < self.config.steps:
+            self.method.finish((), 0)
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
