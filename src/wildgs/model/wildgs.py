@@ -8,11 +8,10 @@ from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import SKY_COLUMNS, changed_harmonics, changed_picture, match_photo
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
@@ -30,11 +29,11 @@ from wildgs.model.method import (
     TrainingOutput,
 )
 from wildgs.model.parsing import Parsing
+from wildgs.model.photo_match import PhotoMatch
 from wildgs.model.rows import paint_visible, take_rows
-from wildgs.model.sky import Sky, find_sky
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping
-from wildgs.rasterize import Projection, Rendering, blend
+from wildgs.rasterize import Projection, blend
 
 
 class WildGS(Method):
@@ -69,9 +68,7 @@ class WildGS(Method):
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
         self.light_basis = LightBasis()
-        self.light_codes = None
-        if config.light_codes and not self._lacks("intrinsic"):
-            self.light_codes = nn.Linear(config.fusion.intrinsic_size, config.light_codes, bias=False)
+        self.photo_match = PhotoMatch(config)
 
     @classmethod
     def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
@@ -108,8 +105,8 @@ class WildGS(Method):
         """With a fresh encoder and any box."""
         box = Box(torch.zeros(3), torch.ones(3))
         model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
-        if "light_codes.weight" not in state:  # of an earlier version
-            model.light_codes = None
+        if "photo_match.codes.weight" not in state:  # of an earlier version
+            model.photo_match.codes = None
         model.light_basis.components = state.get("light_basis.components")
         return model
 
@@ -120,7 +117,7 @@ class WildGS(Method):
 
     def sky(self) -> Bool[Tensor, " N"] | None:
         """Those far from the scene; see `wildgs.model.sky.find_sky`."""
-        sky = self._find_sky(self.gaussians.means)
+        sky = self.photo_match.sky(self.gaussians.means, self._centre)
         return None if sky is None else sky.which
 
     def row_rates(self) -> dict[str, LearningRate]:
@@ -141,13 +138,12 @@ class WildGS(Method):
 
     def appearance_parameters(self) -> tuple[str, ...]:
         """The centres, at which planes are sampled, the fusion network and the basis of lights."""
-        return ("fusion.", "gaussians.rows.means", "light_basis.", "light_codes.")
+        return ("fusion.", "gaussians.rows.means", "light_basis.", "photo_match.")
 
     @property
     def map_columns(self) -> int:
-        """[A | b] and the light codes' of the landmark, and the sky's."""
-        codes = 0 if self.light_codes is None else self.light_codes.out_features
-        return 4 + codes + (SKY_COLUMNS if self.config.sky.points else 0)
+        """Those of `PhotoMatch`."""
+        return self.photo_match.columns
 
     @property
     def basis_size(self) -> int:
@@ -197,36 +193,19 @@ class WildGS(Method):
         if not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, keep)
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
-        if self.config.color_match and trust_mask:
-            appearance = self._match(photo, appearance, projection, keep)
-            appearance = self.light_basis.fit(self, photo, appearance, camera, keep)
-        return appearance
+        if not (self.config.color_match and trust_mask):
+            return appearance
+        intrinsic = self.gaussians.rows["intrinsic"]
+        with torch.no_grad():
+            colors = paint_visible(self, projection, appearance, self.sh_degree)
+            change = self.photo_match.find(
+                photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
+            )
+        return self.light_basis.fit(self, photo, replace(appearance, color_map=change), camera, keep)
 
-    @torch.no_grad()
-    def _match(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        appearance: Appearance,
-        projection: Projection,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Appearance:
-        """Adds what the appearance's own render of the photo is off by."""
-        colors = paint_visible(self, projection, appearance, self.sh_degree)
-        rendering, codes = self._blend_with_codes(projection, colors)
-        sky = self._find_sky(projection.camera.unproject(rendering.depth))
-        change = match_photo(
-            photo,
-            rendering,
-            appearance.visibility,
-            keep,
-            threshold=self.mask_threshold,
-            sky=sky,
-            codes=codes,
-        )
-        return replace(appearance, color_map=change)
-
-    def _find_sky(self, points: Float[Tensor, "*batch 3"]) -> Sky | None:
-        return find_sky(self.config.sky, points.detach(), (self.wrapping.low + self.wrapping.high) / 2)
+    @property
+    def _centre(self) -> Float[Tensor, " 3"]:
+        return (self.wrapping.low + self.wrapping.high) / 2
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
         """M, by 2D Parsing alone."""
@@ -309,23 +288,9 @@ class WildGS(Method):
         )
         if change is None or change.shape[1] == 4:
             return self.fusion(common, local, intrinsic, change)
-        means = self.gaussians.means
-        sky = self._find_sky(means if rows is None else means[rows])
-        return changed_harmonics(self.fusion(common, local, intrinsic), change, sky, self._codes(rows))
-
-    def _codes(self, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N L"]:
-        """Light codes: what a photo's change of colours may depend on, from Gaussian to Gaussian."""
-        intrinsic = self.gaussians.rows["intrinsic"]
-        if rows is not None:
-            intrinsic = take_rows(intrinsic, rows)
-        return intrinsic[:, :0] if self.light_codes is None else self.light_codes(intrinsic)
-
-    def _blend_with_codes(
-        self, projection: Projection, colors: Float[Tensor, "N 3"]
-    ) -> tuple[Rendering, Float[Tensor, "H W L"]]:
-        """A rendering, and the light codes in its pixels."""
-        rendering = blend(projection, torch.cat([colors, self._codes()], dim=1))
-        return replace(rendering, colors=rendering.colors[..., :3]), rendering.colors[..., 3:]
+        means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
+        harmonics = self.fusion(common, local, intrinsic)
+        return self.photo_match.harmonics(harmonics, change, means, intrinsic, self._centre)
 
     def training_pass(
         self,
@@ -345,32 +310,8 @@ class WildGS(Method):
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
-        if not (self.config.color_match and self.config.matched_loss):
-            return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
-        rendering, codes = self._blend_with_codes(projection, colors)
-        rendering = self._matched(photo, rendering, codes, appearance.visibility, camera, keep)
+        intrinsic = self.gaussians.rows["intrinsic"]
+        rendering = self.photo_match.training_render(
+            photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
+        )
         return TrainingOutput(rendering, projection, appearance.visibility)
-
-    def _matched(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        rendering: Rendering,
-        codes: Float[Tensor, "H W L"],
-        visibility: Float[Tensor, "H W"] | None,
-        camera: Camera,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Rendering:
-        """The render as `encode`'s colour match would leave it; no gradient reaches the match itself."""
-        with torch.no_grad():
-            sky = self._find_sky(camera.unproject(rendering.depth))
-            change = self.config.matched_loss * match_photo(
-                photo,
-                rendering,
-                visibility,
-                keep,
-                threshold=self.mask_threshold,
-                sky=sky,
-                codes=codes,
-                training=True,
-            )
-        return replace(rendering, colors=changed_picture(rendering.colors, change, sky, codes))
