@@ -24,7 +24,9 @@ def test_a_training_render_has_the_exposure_of_its_photo(camera, make_wall_model
         torch.testing.assert_close(inner, torch.full_like(inner, value), atol=0.04, rtol=0)
     model.photo_match.config = replace(model.config, matched_loss=0.0)
     rendering = model.training_pass(grey_photo(camera, 0.2), camera, Stage()).rendering
-    assert float(rendering.colors.detach().mean()) > 0.3, "a wall of grey 0.5 under a light that nothing has learnt"
+    assert float(rendering.colors.detach().mean()) > 0.3, (
+        "a wall of grey 0.5 under a light that nothing has learnt"
+    )
 
 
 def test_the_match_takes_no_gradient_and_the_codes_do(camera, make_wall_model) -> None:
