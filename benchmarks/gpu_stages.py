@@ -194,7 +194,7 @@ def main() -> int:
     options = parser.parse_args()
     size = TINY if options.tiny else FULL
     with tempfile.TemporaryDirectory() as folder:
-        scene = make_scene(Path(folder) / "scene", size.width, *((4,) if options.tiny else ()))
+        scene = make_scene(Path(folder) / "scene", size.width, *((8,) if options.tiny else ()))
         return 0 if all(STAGES[stage](scene, size) for stage in options.stage) else 1
 
 
