@@ -11,8 +11,9 @@ from PIL import Image
 
 import wildgs
 from wildgs.errors import UserError
-from wildgs.library.collection import compare_collection, record_collection
+from wildgs.library.collection import changed_options, compare_collection, record_collection
 from wildgs.runs import lock_run
+from wildgs.sfm.config import PairingConfig, SfmConfig
 
 
 @pytest.fixture
@@ -31,7 +32,7 @@ def scene(photos: Path, tmp_path: Path) -> Path:
     """Stands for a scene that was made from them."""
     folder = tmp_path / "run" / "scene"
     (folder / "sparse" / "0").mkdir(parents=True)
-    record_collection(photos, folder)
+    record_collection(photos, folder, SfmConfig(max_features=500))
     return folder
 
 
@@ -81,3 +82,28 @@ def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: P
     with pytest.raises(UserError, match=r"other photos than .*added\.jpg.*--output"):
         wildgs.run(photos, scene.parent)
     assert not (scene.parent / "checkpoints").exists()
+
+
+def test_other_options_than_those_of_the_poses_are_refused(photos: Path, scene: Path) -> None:
+    """They would be dropped without a word; threads decide nothing, and a default may stand for what was given."""
+    asked = SfmConfig(max_features=900, pairing=PairingConfig(neighbours=7), threads=1)
+    with pytest.raises(UserError, match=r"--neighbours was 40, not 7, --max-features was 500, not 900"):
+        wildgs.run(photos, scene.parent, sfm=asked)
+    assert not changed_options(scene, SfmConfig(threads=2))
+
+
+@pytest.mark.parametrize("inside", ["", "run", "more/run"])
+def test_an_output_among_the_photos_is_refused(photos: Path, inside: str) -> None:
+    """Its pictures would be photos of the next run."""
+    for verb in (wildgs.run, wildgs.reconstruct):
+        with pytest.raises(UserError, match="lies in the folder of the photos"):
+            verb(photos, photos / inside)
+    assert len(list(photos.rglob("*"))) == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_record_that_is_no_file_is_refused(photos: Path, scene: Path) -> None:
+    (scene / "collection.json").unlink()
+    os.mkfifo(scene / "collection.json")
+    with pytest.raises(UserError, match="not a regular file"):
+        wildgs.run(photos, scene.parent)

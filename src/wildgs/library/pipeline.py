@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.config import ExecutionConfig, RunConfig, read_config, with_entries
 from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
-from wildgs.library.collection import compare_collection, photo_files, record_collection
+from wildgs.library.collection import (
+    changed_options,
+    compare_collection,
+    photo_files,
+    record_collection,
+)
 from wildgs.library.evaluation import Scores, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.showcase import write_showcase
@@ -23,7 +28,7 @@ from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
 from wildgs.scene.images import UnreadableImageError, open_image
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.reconstruction import reconstruct
+from wildgs.sfm.reconstruction import check_photos, reconstruct
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
@@ -54,7 +59,7 @@ def run(
     steps: int | None = None,
     downscale: float | None = None,
     max_gaussians: int | None = None,
-    holdout: int = 8,
+    holdout: int | None = None,
     sfm: SfmConfig | None = None,
     execution: ExecutionConfig | None = None,
     progress: Progress | None = None,
@@ -62,13 +67,15 @@ def run(
 ) -> FinishedRun:
     """Poses, trains, scores and shows a folder of photos; stages that are done already are not done again.
 
+    A training that was interrupted goes on with the options that it began with, where they are None.
+
     Args:
         photos: Folder of photos.
         output: Run folder; the posed scene goes to OUTPUT/scene.
         steps: Training steps; by default 30,000 on a GPU and 3,000 on a CPU.
         downscale: Divides the photos' width and height; by default to at most 1,600 pixels on a GPU, 400 on a CPU.
         max_gaussians: Upper bound on the number of Gaussians; by default it follows the machine.
-        holdout: Every n-th photo is held out for scoring; 0 for none.
+        holdout: Every n-th photo is held out for scoring, by default every eighth; 0 for none.
         sfm: Options of structure from motion.
         execution: How it is executed.
         progress: Called during all stages.
@@ -79,13 +86,14 @@ def run(
             works on OUTPUT.
     """
     photos, output, progress = Path(photos), Path(output), progress or silent
-    photo_files(photos)  # a wrong folder is said before anything is written
+    check_photos(photos, output)  # a wrong folder is reported before anything is written
     with lock_run(output):
         scene_folder = output / "scene"
         _pose(photos, scene_folder, sfm, progress)
         if not (output / CONFIG_FILE).is_file():
             _estimate_depth_if_possible(scene_folder, progress)
-        config = _configure(scene_folder, steps, downscale, max_gaussians, holdout)
+        stored = read_config(output / CONFIG_FILE) if (output / CONFIG_FILE).is_file() else None
+        config = _configure(scene_folder, stored, steps, downscale, max_gaussians, holdout)
         scene = read_scene(config, execution or ExecutionConfig(), progress)
         train(
             scene,
@@ -115,7 +123,7 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
     """
     if not (scene / "sparse" / "0").is_dir():
         report = reconstruct(photos, scene, sfm, progress=progress)
-        record_collection(photos, scene)
+        record_collection(photos, scene, sfm or SfmConfig())
         for line in report.lines():
             logger.info("%s", line)
         return
@@ -124,6 +132,11 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
         raise UserError(
             f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or "
             f"delete {scene.parent} to start again with these photos"
+        )
+    if options := changed_options(scene, sfm or SfmConfig()):
+        raise UserError(
+            f"{scene} has poses that were made with other options ({options}); leave them out, or choose another "
+            "--output"
         )
     logger.info("%s has poses of these photos already; going on with them", scene)
 
@@ -181,15 +194,28 @@ def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
 
 
 def _configure(
-    scene: Path, steps: int | None, downscale: float | None, max_gaussians: int | None, holdout: int
+    scene: Path,
+    stored: RunConfig | None,
+    steps: int | None,
+    downscale: float | None,
+    max_gaussians: int | None,
+    holdout: int | None,
 ) -> RunConfig:
-    """Steps and size that suit the machine."""
+    """The stored configuration, or steps and size that suit the machine, with the options that were given."""
     gpu = default_device().type == "cuda"
-    steps = steps or (GPU_STEPS if gpu else CPU_STEPS)
-    downscale = downscale or _downscale_for(scene, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE)
-    most = max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
-    train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=most))
-    return RunConfig(scene.resolve(), data=DataConfig(downscale=downscale, holdout=holdout), train=train)
+    if stored is None:
+        size = _downscale_for(scene, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE) if downscale is None else 1.0
+        density = DensityConfig(max_gaussians=DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
+        train = TrainConfig(steps=GPU_STEPS if gpu else CPU_STEPS, density=density)
+        stored = RunConfig(scene, data=DataConfig(downscale=size), train=train)
+    given = {
+        "train.steps": steps,
+        "train.density.max_gaussians": max_gaussians,
+        "data.downscale": downscale,
+        "data.holdout": holdout,
+    }
+    config = with_entries(stored, {name: value for name, value in given.items() if value is not None})
+    return replace(config, scene=scene.resolve())
 
 
 def _downscale_for(folder: Path, long_side: int) -> float:

@@ -6,8 +6,8 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -74,6 +74,14 @@ def reconstruct(
     config, progress = config or SfmConfig(), progress or (lambda stage, done, total: None)
     photos, output = Path(photos), Path(output)
     started = time.perf_counter()
+    check_photos(photos, output)
+    with _writing(output):
+        return _reconstruct(photos, output, config, overwrite, progress, started)
+
+
+def _reconstruct(
+    photos: Path, output: Path, config: SfmConfig, overwrite: bool, progress: Progress, started: float
+) -> SfmReport:
     _restore(output)
     _check_output(photos, output, overwrite)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -119,6 +127,37 @@ def reconstruct(
         report.write(work.scene)
         _move_in(work.scene, output)
     return report
+
+
+def check_photos(photos: Path, output: Path) -> None:
+    """Refuses a folder that does not exist, and an output in it, whose pictures would be taken for photos later.
+
+    Args:
+        photos: Folder of photos.
+        output: Where a scene or run is to be written.
+
+    Raises:
+        UserError: There is no such folder, or the output lies in it.
+    """
+    if not photos.is_dir():
+        raise UserError(f"{photos}: no such folder; give the folder that holds the photos")
+    place, folder = output.resolve(), photos.resolve()
+    if place.is_relative_to(folder):
+        raise UserError(
+            f"{output}: lies in the folder of the photos, {photos}, whose sub-folders are searched for photos; "
+            "choose another --output"
+        )
+
+
+@contextmanager
+def _writing(output: Path) -> Iterator[None]:
+    """Reports a disk that is full or cannot be written to as a user's mistake."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{output} cannot be written ({error}); free disk space, fix permissions or choose another --output"
+        ) from error
 
 
 def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
