@@ -22,6 +22,7 @@ from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.evaluation.photos import PhotoFit, describe_misfits, inspect_photos, write_photos
 from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
 from wildgs.library.logs import logger, run_log
 from wildgs.progress import Progress, counter, silent
@@ -62,6 +63,7 @@ class TrainedRun:
         seconds: Training time, without reading photos and saving.
         num_gaussians: N at the end.
         device: Where it was trained.
+        photos: How well each training photo fits; `find_misfits` picks those that fit no light.
     """
 
     folder: Path
@@ -70,6 +72,7 @@ class TrainedRun:
     seconds: float
     num_gaussians: int
     device: str
+    photos: Sequence[PhotoFit] = ()
 
 
 @dataclass(frozen=True)
@@ -319,7 +322,7 @@ def _train_to_end(
             interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
             raise
         _save_last(saver, writer, trainer.step)
-        result = _result(job, config, trainer)
+        result = replace(_result(job, config, trainer), photos=_inspect(job, trainer))
         logger.info(
             "%s: %d steps in %.1f min on %s, %s Gaussians -> %s",
             label,
@@ -329,7 +332,16 @@ def _train_to_end(
             f"{result.num_gaussians:,}",
             folder,
         )
+        for line in describe_misfits(result.photos):
+            logger.info("%s", line)
     return result
+
+
+def _inspect(job: _Job, trainer: Trainer) -> list[PhotoFit]:
+    """Looks for photos that fit no light, and keeps what it finds in the run folder."""
+    photos = inspect_photos(trainer.method, job.scene, counter(job.progress, "inspecting training photos"))
+    write_photos(job.folder, trainer.step, photos)
+    return photos
 
 
 def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:
