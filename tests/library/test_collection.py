@@ -10,8 +10,10 @@ import pytest
 from PIL import Image
 
 import wildgs
+from wildgs.config import write_config
 from wildgs.errors import UserError
 from wildgs.library.collection import changed_options, compare_collection, record_collection
+from wildgs.library.pipeline import CPU_LONG_SIDE, GPU_LONG_SIDE, _configure, _photo_size
 from wildgs.runs import lock_run
 from wildgs.sfm.config import PairingConfig, SfmConfig
 
@@ -75,6 +77,29 @@ def test_a_second_run_on_one_output_is_refused_at_once(photos: Path, tmp_path: P
     with lock_run(tmp_path / "run"), pytest.raises(UserError, match="in use"):
         wildgs.run(photos, tmp_path / "run")
     assert not (tmp_path / "run" / "scene").exists()
+
+
+def test_every_photo_has_a_limit_of_its_own_unless_the_run_began_otherwise(tmp_path: Path) -> None:
+    assert _photo_size(tmp_path, None, None).downscale == 1
+    assert _photo_size(tmp_path, None, None).max_side in (CPU_LONG_SIDE, GPU_LONG_SIDE)
+    assert _photo_size(tmp_path, None, 2.0) == wildgs.DataConfig(downscale=2.0)
+    assert _photo_size(tmp_path, 300, 2.0) == wildgs.DataConfig(downscale=2.0, max_side=300)
+    # As earlier versions began it: one divisor for all.
+    write_config(tmp_path / "config.yaml", wildgs.RunConfig(data=wildgs.DataConfig(downscale=2.7)))
+    assert _photo_size(tmp_path, None, None) == wildgs.DataConfig(downscale=2.7)
+    assert _photo_size(tmp_path, 300, None).max_side == 300
+
+
+def test_options_that_are_left_out_are_those_of_the_run(tmp_path: Path) -> None:
+    """A bare `wildgs run PHOTOS --output RUN` goes on; what is given again is compared with the run."""
+    file = tmp_path / "config.yaml"
+    data, train = wildgs.DataConfig(downscale=2.0, holdout=4), wildgs.TrainConfig(steps=7)
+    begun = wildgs.RunConfig(tmp_path, data=data, train=train)
+    write_config(file, begun)
+    assert _configure(tmp_path, file, None, _photo_size(tmp_path, None, None), None, None) == begun
+    other = _configure(tmp_path, file, 9, _photo_size(tmp_path, None, 3.0), 50, 0)
+    assert (other.train.steps, other.data.downscale, other.data.holdout) == (9, 3.0, 0)
+    assert other.train.density.max_gaussians == 50
 
 
 def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,6 @@ from wildgs.errors import UserError
 from wildgs.library.collection import (
     changed_options,
     compare_collection,
-    photo_files,
     record_collection,
 )
 from wildgs.library.evaluation import Scores, evaluate
@@ -26,7 +24,6 @@ from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_an
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
-from wildgs.scene.images import UnreadableImageError, open_image
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.reconstruction import check_photos, reconstruct
 
@@ -57,6 +54,7 @@ def run(
     output: str | Path,
     *,
     steps: int | None = None,
+    max_side: int | None = None,
     downscale: float | None = None,
     max_gaussians: int | None = None,
     holdout: int | None = None,
@@ -73,7 +71,9 @@ def run(
         photos: Folder of photos.
         output: Run folder; the posed scene goes to OUTPUT/scene.
         steps: Training steps; by default 30,000 on a GPU and 3,000 on a CPU.
-        downscale: Divides the photos' width and height; by default to at most 1,600 pixels on a GPU, 400 on a CPU.
+        max_side: Reduces each photo so that its own longer side is at most so many pixels; by default 1,600 on a
+            GPU and 400 on a CPU, or no limit where `downscale` is given.
+        downscale: Divides the photos' width and height, before `max_side`.
         max_gaussians: Upper bound on the number of Gaussians; by default it follows the machine.
         holdout: Every n-th photo is held out for scoring, by default every eighth; 0 for none.
         sfm: Options of structure from motion.
@@ -92,8 +92,8 @@ def run(
         _pose(photos, scene_folder, sfm, progress)
         if not (output / CONFIG_FILE).is_file():
             _estimate_depth_if_possible(scene_folder, progress)
-        stored = read_config(output / CONFIG_FILE) if (output / CONFIG_FILE).is_file() else None
-        config = _configure(scene_folder, stored, steps, downscale, max_gaussians, holdout)
+        size = _photo_size(output, max_side, downscale)
+        config = _configure(scene_folder, output / CONFIG_FILE, steps, size, max_gaussians, holdout)
         scene = read_scene(config, execution or ExecutionConfig(), progress)
         train(
             scene,
@@ -195,33 +195,33 @@ def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
 
 def _configure(
     scene: Path,
-    stored: RunConfig | None,
+    file: Path,
     steps: int | None,
-    downscale: float | None,
+    size: DataConfig,
     max_gaussians: int | None,
     holdout: int | None,
 ) -> RunConfig:
-    """The stored configuration, or steps and size that suit the machine, with the options that were given."""
-    gpu = default_device().type == "cuda"
-    if stored is None:
-        size = _downscale_for(scene, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE) if downscale is None else 1.0
+    """The run's own configuration, or one that suits the machine, with the options that were given."""
+    if file.is_file():
+        config = read_config(file)
+    else:
+        gpu = default_device().type == "cuda"
         density = DensityConfig(max_gaussians=DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
-        train = TrainConfig(steps=GPU_STEPS if gpu else CPU_STEPS, density=density)
-        stored = RunConfig(scene, data=DataConfig(downscale=size), train=train)
+        config = RunConfig(scene, train=TrainConfig(steps=GPU_STEPS if gpu else CPU_STEPS, density=density))
     given = {
         "train.steps": steps,
         "train.density.max_gaussians": max_gaussians,
-        "data.downscale": downscale,
         "data.holdout": holdout,
     }
-    config = with_entries(stored, {name: value for name, value in given.items() if value is not None})
-    return replace(config, scene=scene.resolve())
+    config = with_entries(config, {name: value for name, value in given.items() if value is not None})
+    data = replace(config.data, downscale=size.downscale, max_side=size.max_side)
+    return replace(config, scene=scene.resolve(), data=data)
 
 
-def _downscale_for(folder: Path, long_side: int) -> float:
-    """The factor that brings the largest photo to `long_side` pixels; 1 where it is smaller."""
-    sizes = [1]
-    for path in photo_files(folder / "images").values():
-        with contextlib.suppress(UnreadableImageError), open_image(path) as image:
-            sizes.append(max(image.size))
-    return max(1.0, round(max(sizes) / long_side, 2))
+def _photo_size(output: Path, max_side: int | None, downscale: float | None) -> DataConfig:
+    """The size of photos: as asked for, as OUTPUT was begun with, or as it suits the machine."""
+    if max_side is None and downscale is None:
+        if (output / CONFIG_FILE).is_file():
+            return read_config(output / CONFIG_FILE).data
+        max_side = GPU_LONG_SIDE if default_device().type == "cuda" else CPU_LONG_SIDE
+    return DataConfig(downscale=downscale or 1, max_side=max_side)

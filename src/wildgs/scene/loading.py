@@ -173,9 +173,11 @@ def _pixel_grid(image: ColmapImage, config: DataConfig) -> PixelGrid:
         raise UnreadableImageError(
             f"its camera has {size[0]}x{size[1]} pixels, more than --max-image-pixels {config.max_image_pixels}"
         )
-    grid = PixelGrid.from_colmap(image.camera, config.downscale)
+    grid = PixelGrid.from_colmap(image.camera, config.downscale, config.max_side)
     if min(grid.width, grid.height) < 2:
-        raise UnreadableImageError(f"{grid.width}x{grid.height} pixels are too few; lower --downscale")
+        raise UnreadableImageError(
+            f"{grid.width}x{grid.height} pixels are too few; lower --downscale or raise --max-side"
+        )
     return grid
 
 

@@ -35,8 +35,9 @@ from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
 
 SCENE_PARTS = ("images", "sparse", "masks", REPORT_NAME)
-ASIDE, DONE = ".replaced", ".done"
-"""Folder of the old scene while the new one takes its place, and the file in it that says that it has."""
+ASIDE, MOVED, DONE = ".replaced", ".moved", ".done"
+"""Folder of the old scene while the new one takes its place, and the files in it that say that the old scene is
+complete there, and that the new one is in its place."""
 
 __all__ = ["PairingConfig", "Progress", "SfmConfig", "SfmReport", "reconstruct"]
 
@@ -125,6 +126,7 @@ def _reconstruct(
             masks=_files_in(work.scene / "masks"),
         )
         report.write(work.scene)
+        _check_output(photos, output, overwrite)  # another process may have been faster
         _move_in(work.scene, output)
     return report
 
@@ -194,18 +196,15 @@ def _move_in(scene: Path, output: Path) -> None:
     output.mkdir(exist_ok=True)
     aside = output / ASIDE
     aside.mkdir()
-    moved: list[Path] = []
     try:
         for name in (*SCENE_PARTS, "depth"):
             if (output / name).exists():
                 (output / name).rename(aside / name)
+        (aside / MOVED).touch()
         # The report first: with it, what a killed process leaves is known as a scene of `wildgs sfm`.
         for item in sorted(scene.iterdir(), key=lambda item: item.name != REPORT_NAME):
             item.rename(output / item.name)
-            moved.append(output / item.name)
     except BaseException:
-        for item in moved:
-            shutil.rmtree(item) if item.is_dir() else item.unlink()
         _restore(output)
         raise
     kept = [_keep(aside / name, output) for name in _not_made_here(aside)]
@@ -226,11 +225,12 @@ def _restore(output: Path) -> None:
     if not aside.is_dir():
         return
     if not (aside / DONE).exists():
+        if (aside / MOVED).exists():
+            for new in (output / name for name in SCENE_PARTS):
+                shutil.rmtree(new) if new.is_dir() else new.unlink(missing_ok=True)
+            (aside / MOVED).unlink()  # first: what is put back from here on is not the new scene's
         for item in aside.iterdir():
-            new = output / item.name
-            if new.is_dir():
-                shutil.rmtree(new)
-            item.replace(new)
+            item.replace(output / item.name)
     shutil.rmtree(aside)
 
 
