@@ -245,7 +245,6 @@ class Trainer:
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
             observations=self.feed.observations(view),
-            compared=output.compared,
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,
         )

@@ -60,7 +60,6 @@ def total_loss(
     alpha: Float[Tensor, "H W"] | None = None,
     disparity: Float[Tensor, "H W"] | None = None,
     observations: Float[Tensor, "K 2"] | None = None,
-    compared: Float[Tensor, "H W 3"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
 ) -> Losses:
@@ -78,7 +77,6 @@ def total_loss(
         disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
         observations: Pixels (x, y) at which the photo shows triangulated points: the mask learns that these are
             static.
-        compared: The render that the mask's evidence compares with the photo; None takes `render`.
         train_mask: False passes no gradient to the mask (the pause after an opacity reset).
         mask_threshold: Th: the depth loss leaves out pixels whose M is not above it.
 
@@ -88,7 +86,7 @@ def total_loss(
     if visibility is not None and not train_mask:
         visibility = visibility.detach()
     proven = None if observations is None else proven_static(observations, *photo.shape[:2])
-    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven, compared)
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
@@ -106,16 +104,11 @@ def total_loss(
 
 
 def _image_loss(
-    config: ObjectiveConfig,
-    photo: Tensor,
-    render: Tensor,
-    mask: Tensor | None,
-    proven: Tensor | None,
-    compared: Tensor | None,
+    config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None, proven: Tensor | None
 ) -> Tensor:
     """L^I; its gradient to the mask is the formula's or the evidence, as configured."""
     if mask is None or config.mask_gradient == "evidence":
-        return masked_photometric(photo, render, mask, config.weight_l1, proven=proven, compared=compared)
+        return masked_photometric(photo, render, mask, config.weight_l1, proven=proven)
     mask = mask[..., None]
     return masked_photometric(photo * mask, render * mask, None, config.weight_l1)
 

@@ -92,7 +92,6 @@ def match_photo(
     threshold: float,
     sky: Sky | None,
     codes: Float[Tensor, "H W L"],
-    of_sky: Float[Tensor, "3 S"] | None = None,
     training: bool = False,
 ) -> Float[Tensor, "3 M"]:
     """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
@@ -107,7 +106,6 @@ def match_photo(
         threshold: Th: pixels with a visibility above it are static.
         sky: Which pixels show it; None matches all pixels alike.
         codes: Rendered light codes of the landmark, on which its change depends linearly; L may be 0.
-        of_sky: The sky's change where it is known; None finds it.
         training: Reads every third row and column, and gives each channel a gain of its own, no more.
 
     Returns:
@@ -123,8 +121,7 @@ def match_photo(
     if sky is None:
         return match_colors(colors, photo, weights, training, codes[some])
     own = match_colors(colors, photo, weights * ~sky.which[some], training, codes[some])
-    if of_sky is None:
-        of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], training)
+    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], training)
     return torch.cat([own, of_sky], dim=1)
 
 

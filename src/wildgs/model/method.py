@@ -55,13 +55,11 @@ class TrainingOutput:
         rendering: Colours, expected depth and alpha.
         projection: Its screen statistics feed densification.
         visibility: M, or None for a method without a mask.
-        compared: The render in which the mask's evidence is looked for; None takes `rendering`.
     """
 
     rendering: Rendering
     projection: Projection
     visibility: Float[Tensor, "H W"] | None
-    compared: Float[Tensor, "H W 3"] | None = None
 
 
 @dataclass(frozen=True)

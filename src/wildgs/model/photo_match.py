@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -89,7 +88,7 @@ class PhotoMatch(nn.Module):
         """The harmonics of changed colours."""
         return changed_harmonics(harmonics, change, self.sky(means, centre), self.light_codes(intrinsic))
 
-    def training_renders(
+    def training_render(
         self,
         photo: Float[Tensor, "H W 3"],
         projection: Projection,
@@ -98,34 +97,19 @@ class PhotoMatch(nn.Module):
         centre: Float[Tensor, " 3"],
         visibility: Float[Tensor, "H W"] | None,
         keep: Bool[Tensor, "H W"] | None,
-    ) -> tuple[Rendering, Float[Tensor, "H W 3"] | None]:
-        """The render that the loss compares with a photo, and the one in which passers-by are looked for.
-
-        No gradient reaches the match itself. The second render is matched without light codes, which could give
-        the scene the colours of what hides it; None where nothing is matched. See `find` for the arguments.
-        """
+    ) -> Rendering:
+        """The render that the loss compares with a photo; no gradient reaches the match itself. See `find`."""
         share = self.config.matched_loss
         if not (self.config.color_match and share):
-            return blend(projection, colors), None
+            return blend(projection, colors)
         rendering, codes = self._blend(projection, colors, intrinsic)
+        threshold = self.config.mask_threshold
         with torch.no_grad():
             sky = self.sky(projection.camera.unproject(rendering.depth), centre)
-            match = partial(
-                match_photo,
-                photo,
-                rendering,
-                visibility,
-                keep,
-                threshold=self.config.mask_threshold,
-                sky=sky,
-                training=True,
+            change = share * match_photo(
+                photo, rendering, visibility, keep, threshold=threshold, sky=sky, codes=codes, training=True
             )
-            found, none = match(codes=codes), codes[..., :0]
-            plain = match(codes=none, of_sky=found[:, 4 + codes.shape[2] :])
-            compared = changed_picture(rendering.colors, share * plain, sky, none)
-        return replace(
-            rendering, colors=changed_picture(rendering.colors, share * found, sky, codes)
-        ), compared
+        return replace(rendering, colors=changed_picture(rendering.colors, change, sky, codes))
 
     def _blend(
         self, projection: Projection, colors: Float[Tensor, "N 3"], intrinsic: Float[Tensor, "N I"]

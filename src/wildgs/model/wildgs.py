@@ -311,7 +311,7 @@ class WildGS(Method):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
         intrinsic = self.gaussians.rows["intrinsic"]
-        rendering, compared = self.photo_match.training_renders(
+        rendering = self.photo_match.training_render(
             photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
         )
-        return TrainingOutput(rendering, projection, appearance.visibility, compared)
+        return TrainingOutput(rendering, projection, appearance.visibility)
