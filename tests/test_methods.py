@@ -15,9 +15,8 @@ from wildgs.engine.density import DensityConfig
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError
-from wildgs.light.atlas import make_atlas
 from wildgs.light.look import look_of, mix
-from wildgs.light.photos import encode_view
+from wildgs.light.photos import encode_view, make_atlas
 from wildgs.light.saved import load_look, save_look
 from wildgs.model import registry
 from wildgs.model.appearance import Embeddings

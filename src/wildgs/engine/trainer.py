@@ -13,11 +13,10 @@ from torch import Tensor
 
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.density import DensityControl, DensityReport
-from wildgs.engine.feed import PhotoFeed
+from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.safety import StepGuard
-from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning

@@ -17,9 +17,8 @@ from torch import Tensor
 from wildgs.errors import UserError
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.geometry.camera import Camera
-from wildgs.light.look import Look
+from wildgs.light.look import Look, Timeline
 from wildgs.light.sources import LightSources
-from wildgs.light.timeline import Timeline
 from wildgs.model.gaussians import Gaussians
 from wildgs.progress import Progress
 from wildgs.rasterize import blend

@@ -15,8 +15,7 @@ import torch
 
 from wildgs import features
 from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
-from wildgs.engine.autosave import Autosave
-from wildgs.engine.checkpoint_writer import CheckpointWriter
+from wildgs.engine.autosave import Autosave, CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team

@@ -15,9 +15,8 @@ from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_file
-from wildgs.light.atlas import Atlas, make_atlas
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
-from wildgs.light.photos import encode_photo, encode_picture, encode_view
+from wildgs.light.photos import Atlas, encode_photo, encode_picture, encode_view, make_atlas
 from wildgs.light.saved import SUFFIX, load_look
 from wildgs.model.method import Method
 from wildgs.scene import Scene, View, find_view, match_view
