@@ -44,7 +44,7 @@ STAGES = (
 PRELOADED = [
     "wildgs.cli.train",
     "wildgs.library.training",
-    "wildgs.rasterize.cpu.backend",
+    "wildgs.rasterize.cpu",
     "torch.utils.tensorboard",
     "transformers",
 ]

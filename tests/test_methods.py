@@ -21,7 +21,8 @@ from wildgs.light.saved import load_look, save_look
 from wildgs.model import registry
 from wildgs.model.appearance import Embeddings
 from wildgs.model.config import InitialConfig, ParsingConfig, SkyConfig, WrappingConfig
-from wildgs.model.method import GEOMETRY_ROWS, Method, Stage
+from wildgs.model.gaussians import GEOMETRY_ROWS
+from wildgs.model.method import Method, Stage
 from wildgs.model.registry import METHODS, create_method, method_type, restore_method
 from wildgs.presets import with_preset
 from wildgs.scene import Scene

@@ -14,8 +14,8 @@ from wildgs.evaluation.lpips import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
-from wildgs.model.gaussians import Gaussians, geometry_from_points
-from wildgs.model.method import GEOMETRY_ROWS, Method, Stage, TrainingOutput
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, geometry_from_points
+from wildgs.model.method import Method, Stage, TrainingOutput
 from wildgs.rasterize import Rendering
 from wildgs.scene.scene import Alignment, Scene, View
 

@@ -13,10 +13,9 @@ from wildgs.errors import UserError
 from wildgs.geometry.camera_file import read_camera_path
 from wildgs.scene import Scene
 from wildgs.viewer.cameras import pose_of
-from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.lighting import Light, LightDesk
-from wildgs.viewer.recording import MAX_VIEWS, RecordingPanel
-from wildgs.viewer.server import ServerConfig, open_server
+from wildgs.viewer.recording import MAX_VIEWS, RecordingPanel, free_name, make_film
+from wildgs.viewer.serving import ServerConfig, open_server
 from wildgs.viewer.subject import Subject
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")

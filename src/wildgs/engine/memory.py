@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from wildgs.errors import UserError
-from wildgs.model.method import MemoryUse
+from wildgs.model.config import MemoryUse
 from wildgs.model.registry import MethodName, method_type
 from wildgs.scene import Scene
 from wildgs.scene.image_cache import available_memory

@@ -21,9 +21,8 @@ from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
-from wildgs.model.feature_cache import FeatureCache
 from wildgs.model.method import Method, TrainingOutput
-from wildgs.model.parsing import keep_features
+from wildgs.model.parsing import FeatureCache, keep_features
 from wildgs.model.precision import (
     choose_precision,
     lay_out_channels_last,

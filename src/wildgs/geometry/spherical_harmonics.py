@@ -76,11 +76,6 @@ def rgb_to_sh0(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     return (rgb - 0.5) / C0
 
 
-def sh0_to_rgb(sh0: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Colour of coefficients of degree 0, not clamped; the inverse of `rgb_to_sh0`."""
-    return sh0 * C0 + 0.5
-
-
 def sh_degree(sh: Float[Tensor, "N K 3"]) -> int:
     """Degree of spherical harmonics coefficients.
 

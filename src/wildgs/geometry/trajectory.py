@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.lens import Lens, Vector, focal_of, focus, forwards_of, positions_of, unit, usual_lens
-from wildgs.geometry.tour import open_tour, spread_out
 
 FULL_CIRCLE_GAP = 75.0
 """Degrees: an orbit is a full circle if no gap between the cameras is wider than this."""
@@ -224,3 +224,23 @@ def spiral(
         place = home + size * (sideways + np.sin(phase) * forward)
         path.append(lens.camera(place, target - place))
     return path
+
+
+def spread_out(features: Float64[np.ndarray, "V D"], count: int) -> list[int]:
+    """Farthest-point sampling: indices of at most `count` rows, each the farthest from those before.
+
+    The first is the row nearest to the median, so that no outlier decides.
+    """
+    chosen = [int(np.linalg.norm(features - np.median(features, axis=0), axis=1).argmin())]
+    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(features)) and distance.max() > 0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return chosen
+
+
+def open_tour(places: Float64[np.ndarray, "S D"]) -> list[int]:
+    """A short open tour through all places: the leaves of their cluster tree, ordered for short steps."""
+    if len(places) < 3:
+        return list(range(len(places)))
+    return leaves_list(linkage(places, "average", optimal_ordering=True)).tolist()

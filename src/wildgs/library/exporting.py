@@ -8,15 +8,13 @@ from pathlib import Path
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
-from wildgs.exporters.cleanup import agreement, clean
 from wildgs.exporters.config import CleanupConfig
 from wildgs.exporters.formats import SplatFormat, write_splats
-from wildgs.exporters.splats import Splats
+from wildgs.exporters.splats import Splats, agreement, clean
 from wildgs.library.config import ExportFormat, MixOptions
-from wildgs.library.loaded import LoadedScene
+from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.library.logs import logger
-from wildgs.library.looks import find_looks, loaded
-from wildgs.library.webpage import baked, page_looks, viewpoints_of, write_webpage
+from wildgs.library.pages import baked, page_looks, viewpoints_of, write_webpage
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.progress import Progress
 

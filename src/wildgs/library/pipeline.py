@@ -1,4 +1,4 @@
-"""`wildgs.run`: a folder of photos becomes a scored scene with pages to look at."""
+"""`wildgs.run` (a folder of photos), `wildgs.demo` (the built-in photos) and `wildgs.estimate_depth`."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from wildgs.errors import UserError
 from wildgs.library.collection import compare_collection, photo_files, record_collection
 from wildgs.library.evaluation import Scores, evaluate
 from wildgs.library.logs import logger
-from wildgs.library.showcase import write_showcase
+from wildgs.library.pages import write_scene_page, write_showcase
 from wildgs.library.training import read_scene, train
-from wildgs.library.webpage import write_scene_page
+from wildgs.model.config import ParsingConfig, WildGSConfig
+from wildgs.model.registry import MethodName, method_type
 from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
+from wildgs.scene.demo import write_demo_scene
 from wildgs.scene.images import UnreadableImageError, open_image
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.reconstruction import reconstruct
@@ -199,3 +201,70 @@ def _downscale_for(folder: Path, long_side: int) -> float:
         with contextlib.suppress(UnreadableImageError), open_image(path) as image:
             sizes.append(max(image.size))
     return max(1.0, round(max(sizes) / long_side, 2))
+
+
+COMPARED: tuple[MethodName, ...] = ("wildgs", "3dgs")
+TITLE = "Wild-GS demo"
+SUMMARY = (
+    "A made-up landmark in {photos} rendered photos: different hours and cameras, and people in the way. Wild-GS "
+    "and plain 3D Gaussian Splatting were trained on them for {steps:,} steps each. Both are scored on held-out "
+    "photos, against the same views without the people."
+)
+PARSED_SIDE = 160
+MAX_GAUSSIANS = 30_000
+"""As many Gaussians as photos of this size can resolve."""
+
+
+def demo(
+    output: str | Path = "wildgs-demo",
+    *,
+    steps: int = 1500,
+    execution: ExecutionConfig | None = None,
+    progress: Progress | None = None,
+    observers: Sequence[Observer] = (),
+) -> FinishedRun:
+    """Trains Wild-GS and plain 3DGS on the photos of the built-in landmark, scores both and writes pages.
+
+    Args:
+        output: Folder for the scene, both runs, report.html and scene.html.
+        steps: Training steps of each method.
+        execution: How it is executed.
+        progress: Called during all stages.
+        observers: Called with a `StepReport` after every training step.
+
+    Raises:
+        UserError: The pages exist already, or the folder cannot be written to.
+    """
+    output = Path(output)
+    report, page = output / "report.html", output / "scene.html"
+    if steps < 1:
+        raise UserError(f"steps {steps}: must be 1 or more")
+    if report.exists():
+        raise UserError(f"{report} exists already; open it, or choose another --output")
+    with lock_run(output):
+        folder = write_demo_scene(output / "scene")
+        runs = []
+        for method in COMPARED:
+            config = _configuration(folder, method, steps)
+            scene = read_scene(config, execution or ExecutionConfig(), progress)
+            target = output / method
+            train(
+                scene,
+                config,
+                output=target,
+                execution=execution,
+                resume="auto",
+                progress=progress,
+                observers=observers,
+            )
+            loaded = load_run(target)
+            runs.append((method_type(method).label, loaded, evaluate(loaded, scene=scene, progress=progress)))
+        write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
+        write_scene_page(runs[0][1], page, TITLE, progress)
+    return FinishedRun(output, {name: scores for name, _, scores in runs}, report, page)
+
+
+def _configuration(folder: Path, method: MethodName, steps: int) -> RunConfig:
+    train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=MAX_GAUSSIANS))
+    model = WildGSConfig(parsing=ParsingConfig(max_side=PARSED_SIDE))
+    return RunConfig(folder.resolve(), model=model, train=train).with_method(method)

@@ -14,8 +14,7 @@ from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.trajectory import still
 from wildgs.library.config import MixOptions, TrajectoryOptions
-from wildgs.library.loaded import LoadedScene
-from wildgs.library.looks import find_looks, loaded
+from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.progress import Progress, counter
 from wildgs.scene import find_view

@@ -1,4 +1,4 @@
-"""A look: the scene under one appearance, shaded once and then as cheap as plain 3DGS; mixes, and looks over time."""
+"""A look: the scene under one appearance, shaded once; mixes of looks, and looks that change over time."""
 
 from __future__ import annotations
 

@@ -13,24 +13,15 @@ from torch import Tensor
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.color_match import elevation_powers, mapped, match_colors, match_sky
-from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
+from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
-from wildgs.model.gaussians import Gaussians
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.lifting import MIN_ALPHA, lift, liftable, random_part
-from wildgs.model.method import (
-    GEOMETRY_ROWS,
-    MemoryUse,
-    Method,
-    ParameterGroup,
-    Stage,
-    TrainingOutput,
-)
+from wildgs.model.method import Method, ParameterGroup, Stage, TrainingOutput
 from wildgs.model.parsing import Parsing
-from wildgs.model.rows import paint_visible, take_rows
 from wildgs.model.triplane import Box, robust_box
-from wildgs.model.wrapping import Wrapping
+from wildgs.model.wrapping import MIN_ALPHA, Wrapping, lift, liftable, random_part
 from wildgs.rasterize import Projection, blend
 
 
@@ -46,14 +37,7 @@ class WildGS(Method):
     def __init__(
         self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
     ) -> None:
-        """Sets up a `WildGS`.
-
-        Args:
-            config: The model's configuration.
-            gaussians: With a row `intrinsic` beside the geometry.
-            box: What the triplane covers.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Takes Gaussians with a row `intrinsic`, the triplane's box, and an encoder if not the one configured."""
         super().__init__()
         self.config = config
         self.gaussians = gaussians
@@ -80,13 +64,7 @@ class WildGS(Method):
     def create(
         cls, config: WildGSConfig, initial: InitialGaussians, encoder: Encoder | None = None
     ) -> WildGS:
-        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points.
-
-        Args:
-            config: The model's configuration.
-            initial: The first Gaussians.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points."""
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(initial.points, config.wrapping.box_quantile, ratio)
         intrinsic = torch.zeros(len(initial.colors), config.fusion.intrinsic_size)
@@ -167,7 +145,7 @@ class WildGS(Method):
 
         Photos are full of sky: one change for all would do to the landmark what the sky needs.
         """
-        colors = paint_visible(self, projection, appearance, self.sh_degree)
+        colors = self.paint(projection, appearance, self.sh_degree)
         rendering = blend(projection, colors)
         static = liftable(appearance.visibility, rendering.alpha, self.mask_threshold)
         if keep is not None:
@@ -295,5 +273,5 @@ class WildGS(Method):
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
-        colors = paint_visible(self, projection, appearance, stage.sh_degree)
+        colors = self.paint(projection, appearance, stage.sh_degree)
         return TrainingOutput(blend(projection, colors), projection, appearance.visibility)

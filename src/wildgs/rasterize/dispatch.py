@@ -18,7 +18,7 @@ def pick_backend(device: torch.device | str) -> BackendName:
 
 def _module(name: BackendName):
     if name == "cpu":
-        from wildgs.rasterize.cpu import backend as module
+        from wildgs.rasterize import cpu as module
     elif name == "cuda":
         from wildgs.rasterize import cuda as module
     elif name == "reference":

@@ -6,7 +6,6 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -93,33 +92,6 @@ class PhotoStore(ABC):
             UserError: The file is there and cannot be used.
         """
         return None
-
-
-@dataclass
-class MemoryPhotos(PhotoStore):
-    """Photos that are in memory already.
-
-    Attributes:
-        photos: By name.
-        clean: Photos without their transients, by name.
-        truth_masks: True masks, by name.
-    """
-
-    photos: dict[str, Photo] = field(default_factory=dict)
-    clean: dict[str, UInt8[np.ndarray, "_ _ 3"]] = field(default_factory=dict)
-    truth_masks: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
-
-    def get(self, name: str) -> Photo:
-        """See `PhotoStore.get`."""
-        return self.photos[name]
-
-    def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-        """See `PhotoStore.read_clean`."""
-        return self.clean.get(name)
-
-    def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
-        """See `PhotoStore.read_truth_mask`."""
-        return self.truth_masks.get(name)
 
 
 class ScenePhotos(PhotoStore):

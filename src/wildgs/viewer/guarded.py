@@ -24,8 +24,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from wildgs.errors import UserError
-from wildgs.viewer.access import AccessControl
-from wildgs.viewer.messages import MAX_MESSAGE_BYTES, MalformedMessageError, decode, is_acceptable
+from wildgs.viewer.access import (
+    MAX_MESSAGE_BYTES,
+    AccessControl,
+    MalformedMessageError,
+    decode,
+    is_acceptable,
+)
 from wildgs.viewer.uploads import Upload, Uploads
 
 POLICY_VIOLATION = 1008

@@ -21,16 +21,14 @@ from wildgs.geometry.lens import focus
 from wildgs.model.gaussians import NEAR
 from wildgs.scene import Scene, View
 from wildgs.viewer.cameras import ViserCamera, pose_of
-from wildgs.viewer.comparison import compare
 from wildgs.viewer.config import ViewerConfig
 from wildgs.viewer.display import Paint, SplatDisplay
-from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.gallery import Gallery, spread
 from wildgs.viewer.jobs import Job, Jobs
 from wildgs.viewer.lighting import Light, LightDesk, LightPanel, most_different
 from wildgs.viewer.markup import escape
-from wildgs.viewer.photos import PhotoPanel
-from wildgs.viewer.recording import RecordingPanel
+from wildgs.viewer.photos import PhotoPanel, compare
+from wildgs.viewer.recording import RecordingPanel, free_name, make_film
 from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.rasterize.cpu import backward_kernels, forward_kernels, tile_kernels
-from wildgs.rasterize.cpu.projection import TileLists
+from wildgs.rasterize.cpu.projection import TileLists, scratch
 from wildgs.rasterize.cpu.reach_kernels import TILE
-from wildgs.rasterize.cpu.scratch import scratch
 from wildgs.rasterize.interface import Projection, Rendering
 from wildgs.threads import flat, launch
 
