@@ -72,7 +72,7 @@ class Record:
     paused: bool = False
 
     def clear(self) -> None:
-        """Begins anew."""
+        """Starts again."""
         self.launches.clear()
         self.waits.clear()
         self.bytes = 0

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 @runtime_checkable
 class Progress(Protocol):
-    """A callback that long work calls as it goes on; whoever passes one decides how it is shown."""
+    """A callback that long work calls as it continues; whoever passes one decides how it is shown."""
 
     def __call__(self, stage: str, done: int, total: int, /) -> None:
         """Takes note of progress.

@@ -45,7 +45,7 @@ def test_views_are_kept_in_order_and_taken_away_from_the_end(panel: RecordingPan
 
 
 def test_a_view_is_the_camera_at_the_moment(panel: RecordingPanel, wall: Scene) -> None:
-    """viser's camera is one object that goes on moving."""
+    """viser's camera is one object that continues moving."""
     pose = pose_of(wall.views[0].camera)
     panel.add(pose)
     pose.position[:] = np.nan

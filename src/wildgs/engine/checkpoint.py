@@ -51,7 +51,7 @@ class Checkpoint:
 
 
 class DamagedCheckpointError(UserError):
-    """The content of a checkpoint is not what was written: cut short, or changed on the disk."""
+    """A checkpoint whose content is not what was written: truncated, or changed on the disk."""
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> Path:
@@ -133,7 +133,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def load_header(path: Path) -> dict[str, Any]:
-    """The header of a checkpoint, without its tensors and without comparing the checksum; empty if unreadable."""
+    """The header of a checkpoint, without tensors and checksum; empty if it cannot be read."""
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("wildgs", "{}"))

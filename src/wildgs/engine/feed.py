@@ -27,11 +27,11 @@ class ViewSampler:
         self.position = 0
 
     def next(self) -> int:
-        """The next view's index."""
+        """The index of the next view."""
         return self.take(1)[0]
 
     def take(self, count: int) -> list[int]:
-        """The next `count` views' indices, all different; at most as many as there are views."""
+        """Indices of the next `count` views, all different; at most as many as there are views."""
         taken = self.upcoming(count)
         self.position += len(taken)
         missing = count - len(taken)
@@ -47,7 +47,7 @@ class ViewSampler:
         return taken
 
     def upcoming(self, count: int) -> list[int]:
-        """The next views' indices, as far as this round is drawn."""
+        """Indices of the next views, as far as this round has been drawn."""
         return self.order[self.position : self.position + count].tolist()
 
     def state(self) -> dict[str, Tensor]:
@@ -55,11 +55,7 @@ class ViewSampler:
         return {"order": self.order.clone(), "position": torch.tensor(self.position)}
 
     def restore(self, state: dict[str, Tensor]) -> bool:
-        """Goes on where `state` was taken; a round over another number of photos is drawn anew.
-
-        Returns:
-            Whether it goes on in the same order.
-        """
+        """Continues from `state`; whether in the same order, since another number of photos is shuffled again."""
         same = len(state["order"]) in (0, self.count)
         self.order = state["order"] if same else torch.empty(0, dtype=torch.int64)
         self.position = int(state["position"]) if same else 0
@@ -91,7 +87,7 @@ class PhotoFeed:
         self._cameras: dict[str, Camera] = {}
 
     def next_view(self) -> View:
-        """The next photo that can be read; those after it are decoded in the background meanwhile.
+        """The next photo that can be read, while those after it are decoded in the background.
 
         Raises:
             UserError: None can be read any more.
@@ -105,7 +101,7 @@ class PhotoFeed:
         )
 
     def _candidates(self) -> Iterator[int]:
-        """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
+        """This rank's next photo, then replacements for it; the sampler advances equally on all ranks."""
         size, rank = self.team.size, self.team.rank
         for _ in range(len(self.views)):
             batch = self.sampler.take(size)
@@ -125,7 +121,7 @@ class PhotoFeed:
         except UserError as error:
             if view.name not in self._unreadable:
                 self._unreadable.add(view.name)
-                warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+                warnings.warn(f"{error} (training continues without it)", WildGSWarning, stacklevel=3)
             return False
         return True
 

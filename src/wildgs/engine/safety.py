@@ -1,7 +1,8 @@
-"""Steps whose loss or gradient is no number: not taken, counted, and the run's end when they do not stop."""
+"""Skips steps with a non-finite loss or gradient, and ends a run in which they do not stop."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable
 
@@ -16,15 +17,15 @@ PATIENCE = 10
 
 
 class TrainingDivergedError(UserError):
-    """The loss or its gradient was no finite number for `PATIENCE` steps in a row."""
+    """The loss or its gradient was non-finite for `PATIENCE` steps in a row."""
 
 
 class StepGuard:
-    """Judges every step before the optimisers take it.
+    """Checks every step before the optimisers take it.
 
     Attributes:
-        skipped: Steps not taken so far.
-        in_a_row: Steps not taken since the last good one.
+        skipped: Steps skipped so far.
+        in_a_row: Steps skipped since the last one taken.
     """
 
     def __init__(self) -> None:
@@ -33,16 +34,7 @@ class StepGuard:
         self._photos: list[str] = []
 
     def judge(self, photo: str, losses: Losses, parameters: Iterable[Tensor]) -> str | None:
-        """Whether a step may be taken; call after the backward pass.
-
-        Args:
-            photo: Name of the photo that trains.
-            losses: Of this step.
-            parameters: With their gradients.
-
-        Returns:
-            None for a good step, else what is not finite.
-        """
+        """What is non-finite among losses and gradients, None if nothing is; call after the backward pass."""
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         norm = nn.utils.get_total_norm(gradients) if gradients else losses.total.new_zeros(())
         # One number, so that a GPU is waited for once.
@@ -53,26 +45,21 @@ class StepGuard:
         self.skipped += 1
         self.in_a_row += 1
         self._photos.append(photo)
-        terms = [name for name, value in losses.as_floats().items() if not _finite(value)]
+        terms = [name for name, value in losses.as_floats().items() if not math.isfinite(value)]
         return f"loss term {terms[0]}" if terms else "gradient"
 
     def report(self, step: int, fault: str, method: nn.Module) -> None:
-        """Says that a step was not taken.
-
-        Args:
-            step: Its number.
-            fault: From `judge`.
-            method: Searched for parameters that are no numbers, where the run has to end.
+        """Warns of a skipped step whose fault `judge` found.
 
         Raises:
-            TrainingDivergedError: It was one too many in a row.
+            TrainingDivergedError: `PATIENCE` steps in a row were skipped.
         """
         photo = self._photos[-1]
         if self.in_a_row >= PATIENCE:
             raise TrainingDivergedError(_diagnosis(step, fault, self._photos, method))
         if self.in_a_row == 1 or self.skipped <= PATIENCE:
             warnings.warn(
-                f"step {step}, photo {photo}: the {fault} is no finite number; the step is skipped "
+                f"step {step}, photo {photo}: the {fault} is non-finite; the step is skipped "
                 f"({self.skipped} so far)",
                 WildGSWarning,
                 stacklevel=2,
@@ -83,17 +70,13 @@ def _diagnosis(step: int, fault: str, photos: list[str], method: nn.Module) -> s
     broken = [name for name, value in method.named_parameters() if not bool(torch.isfinite(value).all())]
     names = sorted(set(photos))
     if broken:
-        cause = f"the parameters {', '.join(broken[:3])} hold values that are no numbers"
+        cause = f"the parameters {', '.join(broken[:3])} hold non-finite values"
     elif len(names) == 1:
         cause = f"all of them on the photo {names[0]}; look at it and its camera, or take it out of the scene"
     else:
-        cause = f"on {len(names)} photos ({', '.join(names[:3])}, ...), with parameters that are sound"
+        cause = f"on {len(names)} photos ({', '.join(names[:3])}, ...), with finite parameters"
     return (
-        f"training diverged at step {step}: {PATIENCE} steps in a row had no finite {fault}: {cause}. "
-        "The newest checkpoint is from before; --resume goes on from it, and lower learning rates "
+        f"training diverged at step {step}: {PATIENCE} steps in a row had a non-finite {fault}: {cause}. "
+        "The newest checkpoint was saved before; --resume continues from it, and lower learning rates "
         "(--optimizer.*) in a new run may help"
     )
-
-
-def _finite(value: float) -> bool:
-    return value - value == 0

@@ -1,4 +1,4 @@
-"""The training loop. It knows no screen and no file: observers watch it, and `state` is all there is to save."""
+"""The training loop. It prints and writes nothing: observers watch it, and `state` is what a checkpoint holds."""
 
 from __future__ import annotations
 
@@ -86,16 +86,16 @@ class Trainer:
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
-        """Sets up a `Trainer`.
+        """Prepares training at step 0.
 
         Args:
-            method: Trained in place, on the device on which its parameters are.
+            method: Trained in place, on the device of its parameters.
             scene: The photos; nothing of it under `truth/` is read.
-            config: How.
-            team: The processes that train this model together; by default this one alone.
+            config: Training options.
+            team: The processes that train this model; by default this one alone.
 
         Raises:
-            UserError: There is no photo to train on, or there are fewer than processes.
+            UserError: There is no photo to train on, or there are fewer photos than processes.
         """
         self.views = scene.train_views
         self.team = team or Team()
@@ -140,7 +140,7 @@ class Trainer:
             self.end()
 
     def begin(self) -> None:
-        """Gets the method and this process ready for `advance`; `run` calls it. `end` undoes it.
+        """Prepares the method and this process for `advance`; `run` calls it. `end` undoes it.
 
         Raises:
             UserError: The ranks cannot train one model: their photos, models or versions differ.
@@ -149,7 +149,7 @@ class Trainer:
         precision = choose_precision(self.config.precision, self.device)
         self.team.require_same(same_everywhere(self.method, self.views, self.config, precision))
         if self.step == 0:
-            with self.team.together():
+            with self.team.propagate_errors():
                 self._prepare()
         self.team.share(self.method.state_dict().values())
         set_precision(self.method, precision)
@@ -157,7 +157,7 @@ class Trainer:
         keep_features(self.method, FeatureCache(self.feature_cache))
 
     def end(self) -> None:
-        """Undoes `begin`: the method in float32 without graphs, the process's settings as they were before."""
+        """Undoes `begin`: float32, no CUDA graphs, and the process's settings as they were before."""
         set_precision(self.method, torch.float32)
         switch_replays(self.method, False)
         keep_features(self.method, None)
@@ -178,7 +178,7 @@ class Trainer:
             self.optimizers.step()
         else:
             self.method.zero_grad(set_to_none=True)
-            with self.team.together():
+            with self.team.propagate_errors():
                 self.guard.report(self.step + 1, fault, self.method)
         before = self.step
         self.step = min(before + self.team.size, self.config.steps)
@@ -234,7 +234,7 @@ class Trainer:
         return report
 
     def shrink_to_budget(self) -> int:
-        """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
+        """Drops Gaussians beyond `density.max_gaussians`, where that was lowered since; returns how many."""
         budget = self.config.density.max_gaussians
         return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
 
@@ -246,7 +246,7 @@ class Trainer:
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that training needs to go on exactly, as flat tensors."""
+        """Everything that training needs to continue exactly, as flat tensors."""
         state = {f"method.{name}": value for name, value in self.method.state_dict().items()}
         state |= {f"optimizer.{name}": value for name, value in self.optimizers.state().items()}
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
@@ -259,11 +259,13 @@ class Trainer:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Goes on from `state`; the method must have been restored from the same checkpoint already."""
+        """Continues from `state`; the method must have been restored from the same checkpoint already."""
         self.optimizers.restore(_under(state, "optimizer."))
         if not self.sampler.restore(_under(state, "sampler.")):
-            message = f"the run began with other photos than the {len(self.views)} that train now"
-            warnings.warn(f"{message}; it goes on with these", WildGSWarning, stacklevel=2)
+            message = (
+                f"the run began with other photos; it continues with the {len(self.views)} that there are now"
+            )
+            warnings.warn(message, WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         self._process.set_random_states(_under(state, "random."))

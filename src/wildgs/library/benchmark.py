@@ -16,7 +16,7 @@ import torch
 from wildgs import processes
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.checkpoint import list_checkpoints
-from wildgs.engine.distributed import settle
+from wildgs.engine.distributed import assign_device
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
@@ -99,7 +99,7 @@ def benchmark(
 ) -> Benchmark:
     """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
 
-    The same call goes on where it stopped and skips what is done. A run that fails is named, and the others go on.
+    The same call continues where it stopped and skips what is done. A run that fails does not stop the others.
 
     Args:
         scenes: Scene folders; for a suite, the folder that holds its scenes.
@@ -130,7 +130,7 @@ def benchmark(
         announce or logger.info,
     )
     if processes.world_size() > 1:
-        settle()
+        assign_device()
     base = config or RunConfig()
     methods = default_bench_methods(suite) if methods is None else methods
     jobs = _plan(request, [Path(s) for s in scenes], base, methods, seeds)

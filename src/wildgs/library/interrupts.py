@@ -64,7 +64,7 @@ class StopOnSignal:
             if number == getattr(signal, "SIGHUP", None):
                 return  # a closed terminal sends it to every process of a group, more than once
             raise KeyboardInterrupt
-        self.received = self.team.wish = number
+        self.received = self.team.received_signal = number
         with contextlib.suppress(OSError, RuntimeError):  # the signal may have come in the middle of a write
             logger.info("stopping after this step, then saving; a second signal stops at once, unsaved")
 
@@ -74,5 +74,5 @@ class StopOnSignal:
         Raises:
             InterruptedTrainingError: It has.
         """
-        if self.team.verdict:
-            raise InterruptedTrainingError(f"interrupted at step {report.step}", self.team.verdict)
+        if self.team.stop_signal:
+            raise InterruptedTrainingError(f"interrupted at step {report.step}", self.team.stop_signal)

@@ -29,7 +29,7 @@ from wildgs.runs import Run, load_run
 from wildgs.scene import Scene, View
 from wildgs.scene.trajectories import make_path
 
-LANDMARK_FILE = "landmarks.safetensors"
+FEATURE_INDEX_FILE = "feature_index.safetensors"
 """In the run folder: what new photos are localised against, made when the first one comes."""
 
 
@@ -43,7 +43,7 @@ class LoadedScene:
     def __init__(self, run: Run) -> None:
         """Sets up a `LoadedScene`; `load` is the usual way."""
         self.run = run
-        self._sources = LightSources(run.method, lambda: self.scene, run.folder / LANDMARK_FILE)
+        self._sources = LightSources(run.method, lambda: self.scene, run.folder / FEATURE_INDEX_FILE)
 
     @property
     def scene(self) -> Scene:

@@ -127,7 +127,7 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
             f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or "
             f"delete {scene.parent} to start again with these photos"
         )
-    logger.info("%s has poses of these photos already; going on with them", scene)
+    logger.info("%s has poses of these photos already; continuing with them", scene)
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def estimate_depth(
 
 
 def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
-    """Fills what is missing in the scene's depth folder; warns and goes on where the network cannot be had."""
+    """Fills what is missing in the scene's depth folder; warns and continues where the network cannot be had."""
     estimator = load_depth_anything()
     if estimator is not None:
         fill_depth_folder(scene, estimator, progress=counter(progress, "estimating depth"))

@@ -101,14 +101,14 @@ def train(
     """Trains a run to its end.
 
     The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. Where a GPU's memory runs
-    out, training goes on once from the newest checkpoint with fewer Gaussians.
+    out, training continues once from the newest checkpoint with fewer Gaussians.
 
     Args:
         scene: A scene folder, or a scene read from one.
         config: What decides the outcome; the defaults where None, or the run's own on resuming.
         output: The run folder.
         execution: How it is executed; without influence on the outcome.
-        resume: Go on from the newest checkpoint; "auto" does so where the folder holds a run.
+        resume: Continue from the newest checkpoint; "auto" does so where the folder holds a run.
         max_gaussians: A bound on the number of Gaussians that is refused, not lowered, where memory is short.
         progress: Called for every photo read and for every step.
         observers: Called with a `StepReport` after every step.
@@ -138,10 +138,10 @@ def train(
             config = with_budget(config, max_gaussians)
         if not isinstance(scene, Scene):
             config = replace(config, scene=Path(scene).resolve())
-        with team.together():
+        with team.propagate_errors():
             read = scene if isinstance(scene, Scene) else read_scene(config, execution, progress)
         if not resume:
-            with team.together():
+            with team.propagate_errors():
                 config = plan_memory(config, read, explicit=max_gaussians is not None)
             config = with_budget(config, team.least(config.train.density.max_gaussians))
         job = _Job(folder, read, execution, team, progress, observers, attach)
@@ -149,7 +149,7 @@ def train(
 
 
 def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunConfig:
-    """The configuration with which a run goes on.
+    """The configuration with which a run continues.
 
     Raises:
         UserError: Another one is asked for than the run began with.
@@ -161,8 +161,8 @@ def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunCon
     if differing:
         changes = ", ".join(f"{path} is {old}, not {new}" for path, (old, new) in list(differing.items())[:3])
         raise UserError(
-            f"{folder} holds a run with other settings ({changes}): a run goes on with those it began with; leave "
-            "the options out, or choose another --output for a new run"
+            f"{folder} holds a run with other settings ({changes}), which resuming cannot change; leave these options "
+            "out, or choose another --output for a new run"
         )
     return asked
 
@@ -219,14 +219,14 @@ def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> Train
     torch.cuda.empty_cache()
     budget = result.train.density.max_gaussians
     message = (
-        f"the GPU's memory ran out; going on from the newest checkpoint with at most {budget:,} Gaussians"
+        f"the GPU's memory ran out; continuing from the newest checkpoint with at most {budget:,} Gaussians"
     )
     warnings.warn(message, WildGSWarning, stacklevel=3)
     again = _train_unless_full(job, result, True)
     if isinstance(again, TrainedRun):
         return again
     raise UserError(
-        "the GPU's memory ran out again: go on with --resume and a lower --max-gaussians, or start anew with a "
+        "the GPU's memory ran out again: continue with --resume and a lower --max-gaussians, or start again with a "
         "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
     )
 
@@ -261,7 +261,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
     except torch.OutOfMemoryError as error:
         if job.team.size > 1:
             raise UserError(
-                "a GPU's memory ran out: go on with --resume and a lower --max-gaussians"
+                "a GPU's memory ran out: continue with --resume and a lower --max-gaussians"
             ) from error
         count = len(job.scene.points) if trainer is None else len(trainer.method.gaussians)
         budget = min(count, config.train.density.max_gaussians)
@@ -315,7 +315,7 @@ def _train_to_end(
             trainer.run([recorder, *observers, show, saver, stop])
         except InterruptedTrainingError as interrupt:
             team.from_first(lambda: _save_last(saver, writer, trainer.step, hurry=True))
-            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
+            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume continues",)
             raise
         _save_last(saver, writer, trainer.step)
         result = _result(job, config, trainer)

@@ -64,7 +64,7 @@ def load_look(method: Method, file: Path) -> Look:
         name, owner = str(header["name"]), header["run"]
         if not method.relightable or owner != method.fingerprint():
             raise UserError(
-                f"{file}: was made with another run, or another step of this one; make it anew with "
+                f"{file}: was made with another run, or another step of this one; create it again with "
                 "`wildgs appearance`"
             )
         return Look(name, _fitting(method, tensors), method)

@@ -39,19 +39,19 @@ class LightSources:
     """Finds the looks of one scene by what a user writes, and keeps the last few."""
 
     def __init__(
-        self, method: Method, open_scene: Callable[[], Scene], landmark_cache: Path | None = None
+        self, method: Method, open_scene: Callable[[], Scene], index_cache: Path | None = None
     ) -> None:
         """Sets up `LightSources`.
 
         Args:
             method: The trained method.
             open_scene: Reads the scene when it is first needed: a saved appearance needs none.
-            landmark_cache: File that keeps what new photos are localised against.
+            index_cache: File that keeps what new photos are localised against.
         """
         self.method = method
         self._open_scene = open_scene
-        self._landmark_cache = landmark_cache
-        self._landmarks: FeatureIndex | None = None
+        self._index_cache = index_cache
+        self._index: FeatureIndex | None = None
         self._kept: OrderedDict[tuple[str, str | None, tuple[int, ...]], Look] = OrderedDict()
         self._atlas: Atlas | None = None
 
@@ -126,14 +126,14 @@ class LightSources:
 
     def _locate(self, file: Path, progress: Progress) -> Look:
         """The look of a new photo of the place."""
-        if self._landmarks is None:
-            self._landmarks = load_feature_index(
+        if self._index is None:
+            self._index = load_feature_index(
                 self.scene,
-                self._landmark_cache,
+                self._index_cache,
                 lambda done, total: progress("finding features of the scene's photos", done, total),
             )
         long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
-        found = localize(file, self._landmarks, long_side)
+        found = localize(file, self._index, long_side)
         appearance = encode_photo(self.method, found.photo, found.camera)
         return look_of(self.method, appearance, file.name, found.describe())
 

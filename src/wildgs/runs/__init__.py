@@ -185,7 +185,7 @@ def refuse_trained(folder: Path) -> None:
     if checkpoints.exists() and not checkpoints.is_dir():
         raise UserError(f"{checkpoints} is not a folder: move it away, or choose another --output")
     if list_checkpoints(checkpoints):
-        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+        raise UserError(f"{folder} already holds a run; add --resume to continue, or choose another --output")
 
 
 def prepare_training(
@@ -205,7 +205,7 @@ def prepare_training(
         folder: The run folder.
         config: Of the run.
         scene: What is trained on.
-        resume: Whether to go on with a run.
+        resume: Whether to continue with a run.
         team: The processes that train together.
         progress: Called with (photos, photos in all) while the run folder gets its copies of the photos.
 
@@ -221,7 +221,7 @@ def prepare_training(
         team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
     trainer = resume_training(folder, scene, team=team, progress=progress)
     if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
-        # Saved at once, so that a run killed from here on goes on from this very state.
+        # Saved at once, so that a run killed from here on continues from this very state.
         team.from_first(lambda: save_run(folder, trainer, config, scene.alignment))
     return trainer
 
@@ -243,7 +243,7 @@ def start_training(
     team.from_first(lambda: _claim(folder, config, scene, progress))
     device = device or default_device()
     # The trainer keeps the generators' states; the process gets its own back.
-    with team.together(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+    with team.propagate_errors(), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.train.seed)
         budget = config.train.density.max_gaussians
         method = create_method(
@@ -280,7 +280,7 @@ def resume_training(
     if checkpoint is None:
         return start_training(folder, config, scene, device, team, progress)
     record = team.from_first(lambda: carried_record(folder, scene, progress))
-    with team.together(), _complete(folder):
+    with team.propagate_errors(), _complete(folder):
         method = restore_method(config.method, config.model, checkpoint.method)
         scene = adopt_scene(record, scene, folder)
         trainer = Trainer(method.to(device or default_device()), scene, config.train, team)
@@ -289,7 +289,7 @@ def resume_training(
 
 
 def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Alignment) -> Path:
-    """Writes a checkpoint from which training can go on and every other verb can read.
+    """Writes a checkpoint from which training can continue and every other verb can read.
 
     Raises:
         UserError: It cannot be written.

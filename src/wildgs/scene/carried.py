@@ -59,7 +59,7 @@ def carry_scene(folder: Path, scene: Scene, progress: Progress | None = None) ->
         number, view = numbered
         try:
             photo = view.photos.get(view.name)
-        except UserError:  # gone since it was first read; training goes on without it, too
+        except UserError:  # gone since it was first read; training continues without it, too
             return
         _write_photo(lights, number, photo, side)
 

@@ -176,7 +176,7 @@ def _orientation(image: Image.Image) -> int:
 def _upright(image: Image.Image) -> Image.Image:
     """The loaded picture with its EXIF orientation applied.
 
-    `ImageOps.exif_transpose` also writes the EXIF block anew, which fails on blocks with odd entries.
+    `ImageOps.exif_transpose` also rewrites the EXIF block, which fails on blocks with odd entries.
     """
     method = TRANSPOSITIONS.get(_orientation(image))
     return image if method is None else image.transpose(method)

@@ -1,6 +1,6 @@
 """What a new photo is localised against: SIFT descriptors of a scene's triangulated points.
 
-Features are found anew in the scene's photos, and one that lies where a photo observes a point stands for that
+Features are detected again in the scene's photos, and one that lies where a photo observes a point stands for that
 point. Cameras, points, their observations and the photos are all that is needed: a run carries them
 (`wildgs.scene.carried`), and no database of the reconstruction has to be kept.
 """
@@ -168,19 +168,19 @@ def find_features(
 
 
 def match_features(
-    features: UInt8[np.ndarray, "F 128"], landmarks: FeatureIndex, ratio: float
+    features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, ratio: float
 ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
     """Features that look like one point and like no other (Lowe's ratio test, over points instead of features).
 
     Args:
         features: Descriptors of a new photo.
-        landmarks: What is sought.
+        index: What is sought.
         ratio: Largest distance to the best point, relative to the best of all other points.
 
     Returns:
         Rows of features and of points; every point once, with the feature most like it.
     """
-    likeness, owners = _nearest(features, landmarks)
+    likeness, owners = _nearest(features, index)
     distance = np.arccos(np.clip(likeness, -1, 1))
     rivals = np.where(owners == owners[:, :1], np.inf, distance).min(axis=1)
     good = np.flatnonzero(distance[:, 0] < ratio * np.minimum(rivals, np.pi / 2))
@@ -191,14 +191,14 @@ def match_features(
 
 
 def _nearest(
-    features: UInt8[np.ndarray, "F 128"], landmarks: FeatureIndex, count: int = 8, block: int = 65_536
+    features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, count: int = 8, block: int = 65_536
 ) -> tuple[Shaped[np.ndarray, "F k"], Int64[np.ndarray, "F k"]]:
     """Cosine and owner of the descriptors most alike, the best first, without the whole table in memory."""
     queries = torch.nn.functional.normalize(torch.from_numpy(features).float(), dim=1)
-    owners = torch.from_numpy(landmarks.owners)
+    owners = torch.from_numpy(index.owners)
     likeness, best = torch.zeros(len(queries), 0), torch.zeros(len(queries), 0, dtype=torch.int64)
     for start in range(0, len(owners), block):
-        rows = torch.from_numpy(landmarks.descriptors[start : start + block]).float()
+        rows = torch.from_numpy(index.descriptors[start : start + block]).float()
         cosines = queries @ torch.nn.functional.normalize(rows, dim=1).T
         found = cosines.topk(min(count, len(rows)), dim=1)
         likeness = torch.cat([likeness, found.values], dim=1)

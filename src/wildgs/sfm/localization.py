@@ -79,12 +79,12 @@ class LocalizedPhoto:
         )
 
 
-def localize(file: Path, landmarks: FeatureIndex, long_side: int, *, seed: int = 0) -> LocalizedPhoto:
+def localize(file: Path, index: FeatureIndex, long_side: int, *, seed: int = 0) -> LocalizedPhoto:
     """Finds the camera of a photo of the place.
 
     Args:
         file: The photo; any size, upright or with an EXIF orientation.
-        landmarks: Of the scene.
+        index: Of the scene.
         long_side: Pixels to which the photo is shrunk for use.
         seed: Of RANSAC.
 
@@ -100,8 +100,8 @@ def localize(file: Path, landmarks: FeatureIndex, long_side: int, *, seed: int =
     features, descriptors = find_features(pixels)
     matched, seen = (np.zeros(0, np.int64),) * 2
     if len(features):
-        matched, seen = match_features(descriptors, landmarks, MATCH_RATIO)
-    answer = _solve(features[matched], landmarks.points[seen], camera, known, seed)
+        matched, seen = match_features(descriptors, index, MATCH_RATIO)
+    answer = _solve(features[matched], index.points[seen], camera, known, seed)
     inliers = 0 if answer is None else int(answer["num_inliers"])
     if answer is None or inliers < MIN_INLIERS:
         raise LocalizationError(
@@ -115,7 +115,7 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
     """A camera with the EXIF block's focal length where it has one, and whether it has.
 
     COLMAP (in C++, in the trainer's own process where a viewer asks) sees no byte of the file: only the entries
-    that Pillow could read, written anew beside a small empty picture of the same shape.
+    that Pillow could read, rewritten beside a small empty picture of the same shape.
     """
     try:
         with tempfile.TemporaryDirectory() as folder, open_image(file) as image, quiet():

@@ -26,7 +26,7 @@ MATCHING_BLOCK = 50
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders and files beside the output while the work goes on."""
+    """Folders and files beside the output while the work continues."""
 
     root: Path
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
 
 REPAINT_SECONDS = 0.4
-"""While the camera moves, colours follow no more often: each time, all splats are sent anew."""
+"""While the camera moves, colours follow no more often: each time, all splats are sent again."""
 REPAINT_DISTANCE = 0.01
 """In the photos' usual depth; a shorter way changes no direction by more than about half a degree."""
 FAR = 1000.0
@@ -155,7 +155,7 @@ class Viewer:
         self._ask("film", lambda: self._film(client))
 
     def ask_for_update(self) -> None:
-        """Has the subject's present state shown: its Gaussians, its light encoded anew, the photo in question."""
+        """Has the subject's present state shown: its Gaussians, its light encoded again, the photo in question."""
         self._ask("light", self._relight)
         if self.photos.current is not None:
             self._ask("compare", self._compare)
