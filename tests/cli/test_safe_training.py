@@ -18,7 +18,7 @@ from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
+from wildgs.library.logs import InterruptedTrainingError, StopOnSignal
 from wildgs.library.training import train
 from wildgs.runs import load_run, lock_run
 

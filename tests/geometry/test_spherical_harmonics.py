@@ -11,7 +11,6 @@ from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.geometry.spherical_harmonics import (
     fit_truncation,
     num_sh_bases,
-    rgb_to_sh0,
     rotate_sh,
     sh_basis,
     sh_degree,
@@ -39,12 +38,6 @@ def test_lower_degrees_are_prefixes():
     full = sh_basis(3, directions)
     for degree in range(3):
         assert torch.equal(sh_basis(degree, directions), full[:, : num_sh_bases(degree)])
-
-
-def test_flat_colour_round_trip():
-    rgb = torch.rand(4, 3)
-    assert torch.allclose(sh0_to_rgb(rgb_to_sh0(rgb)), rgb, atol=1e-6)
-    assert torch.allclose(rgb_to_sh0(rgb) * sh_basis(0, torch.eye(3)[:1]) + 0.5, rgb, atol=1e-6)
 
 
 def test_degree_out_of_range():

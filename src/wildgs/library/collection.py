@@ -1,4 +1,4 @@
-"""Which photos the poses of `wildgs run` were made from, so that another collection is not mistaken for it."""
+"""Records which photos the poses of `wildgs run` were computed from, to detect other photos in the same folder."""
 
 from __future__ import annotations
 
@@ -18,13 +18,7 @@ NAMED = 3
 
 @dataclass(frozen=True)
 class PhotoRecord:
-    """One photo.
-
-    Attributes:
-        size: Bytes.
-        modified: Time of the last change, nanoseconds.
-        digest: SHA-256 of its content.
-    """
+    """Size in bytes, time of the last change in nanoseconds, and SHA-256 of a photo."""
 
     size: int
     modified: int
@@ -63,11 +57,7 @@ def photo_files(folder: Path) -> dict[str, Path]:
 
 
 def record_collection(photos: Path, scene: Path) -> None:
-    """Writes down, beside a scene, which photos it was made from.
-
-    Raises:
-        UserError: A photo cannot be read, or the disk is full.
-    """
+    """Writes, beside a scene, which photos it was made from; `UserError` if a photo cannot be read."""
     records = {name: asdict(_record(path)) for name, path in photo_files(photos).items()}
     with written_aside(scene / FILE) as aside:
         aside.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")

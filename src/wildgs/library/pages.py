@@ -29,20 +29,22 @@ PAGE_LIGHTS = 4
 
 
 @dataclass(frozen=True)
-class WrittenPage:
-    """What came of it.
+class ExportedFile:
+    """A written file.
 
     Attributes:
-        file: The page.
+        file: Where it was written.
         megabytes: Its size.
-        sh_degree: Degree of the spherical harmonics that it carries.
-        num_gaussians: Gaussians that it carries.
+        num_gaussians: Gaussians in it.
+        sh_degree: Degree of its spherical harmonics.
+        looks: The appearances that it holds: one, or all of the page's.
     """
 
     file: Path
     megabytes: float
-    sh_degree: int
     num_gaussians: int
+    sh_degree: int
+    looks: tuple[Look, ...]
 
 
 @torch.no_grad()
@@ -53,19 +55,8 @@ def write_webpage(
     *,
     title: str,
     cleanup: CleanupConfig | None = None,
-) -> WrittenPage:
-    """Writes the page of a run under some looks.
-
-    Args:
-        loaded: The run.
-        looks: From left to right; the page opens under the first.
-        file: The HTML file.
-        title: Its headline.
-        cleanup: What to leave out.
-
-    Raises:
-        ValueError: Nothing is left to show.
-    """
+) -> ExportedFile:
+    """Writes the page of a run under some looks, the first of which it opens with; `cleanup` drops Gaussians."""
     cleanup = cleanup or CleanupConfig()
     scene = loaded.scene
     views = scene.train_views or scene.views
@@ -85,10 +76,10 @@ def write_webpage(
         near=NEAR,
     )
     degree = write_page(page, file, viewpoints=viewpoints_of(scene.views), sh_degree=cleanup.sh_degree)
-    return WrittenPage(file, file.stat().st_size / 1e6, degree, len(page.splats))
+    return ExportedFile(file, file.stat().st_size / 1e6, len(page.splats), degree, tuple(looks))
 
 
-def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> WrittenPage:
+def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> ExportedFile:
     """Writes the page of a run under lights chosen for it; ends `wildgs run` and `wildgs demo`."""
     loaded = LoadedScene(run)
     return write_webpage(loaded, page_looks(loaded, progress), file, title=title)
@@ -134,14 +125,14 @@ def write_showcase(
     scene: Scene,
     runs: Sequence[tuple[str, Run, Scores]],
 ) -> None:
-    """Writes the page.
+    """Writes the report of some runs of one scene.
 
     Args:
         file: The HTML file.
         title: Its headline.
         summary: A paragraph below it.
         scene: The scene of all runs.
-        runs: Name, run and scores; the first is shown in pictures, the second is its baseline.
+        runs: Name, run and scores; pictures show the first, and the second as its baseline.
     """
     shown = runs[0][1].method
     baseline = runs[1][1].method if len(runs) > 1 else None

@@ -1,4 +1,4 @@
-"""`wildgs.train`: a scene with poses becomes a trained run; memory, records, checkpoints and signals around it."""
+"""`wildgs.train`: trains a scene with poses, within memory, with records, checkpoints and signals."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
-from wildgs.library.logs import logger, run_log
+from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, run_log
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import (
     CHECKPOINT_FOLDER,
@@ -42,26 +41,17 @@ from wildgs.threads import limited
 LEAST_SECONDS_ON_CUDA = 60.0
 """Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
 RETRY_SHARE = 0.8
-"""Share of the Gaussians with which memory ran out that the second try may have."""
+"""Bound on the Gaussians of the second try, as a share of those with which memory ran out."""
 BUDGET = "train.density.max_gaussians"
 """The one entry that may change when a run is resumed: it depends on the machine's memory."""
 
 Attachment = Callable[[Trainer, Scene], AbstractContextManager[Observer]]
-"""Opens an observer for one training, as a viewer is; closed when the training ends or fails."""
+"""Opens an observer of one training, such as a viewer, which is closed when the training ends or fails."""
 
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """What a training left.
-
-    Attributes:
-        folder: The run folder.
-        config: Its configuration.
-        steps: Steps done.
-        seconds: Training time, without reading photos and saving.
-        num_gaussians: N at the end.
-        device: Where it was trained.
-    """
+    """A finished training; `seconds` excludes reading photos and saving, `device` is the GPU's name or the CPU."""
 
     folder: Path
     config: RunConfig
@@ -73,7 +63,7 @@ class TrainedRun:
 
 @dataclass(frozen=True)
 class _Job:
-    """What stays the same when a training is tried again."""
+    """What stays the same when training is tried again with fewer Gaussians."""
 
     folder: Path
     scene: Scene
@@ -100,16 +90,16 @@ def train(
 ) -> TrainedRun:
     """Trains a run to its end.
 
-    The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. Where a GPU's memory runs
-    out, training continues once from the newest checkpoint with fewer Gaussians.
+    The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. If a GPU's memory runs out,
+    training continues once from the newest checkpoint with fewer Gaussians.
 
     Args:
         scene: A scene folder, or a scene read from one.
-        config: What decides the outcome; the defaults where None, or the run's own on resuming.
+        config: Options that decide the outcome; None takes the defaults, or the run's own on resuming.
         output: The run folder.
-        execution: How it is executed; without influence on the outcome.
-        resume: Continue from the newest checkpoint; "auto" does so where the folder holds a run.
-        max_gaussians: A bound on the number of Gaussians that is refused, not lowered, where memory is short.
+        execution: Options without influence on the outcome.
+        resume: Continue from the newest checkpoint; "auto" does so if the folder holds a run.
+        max_gaussians: Bound on the number of Gaussians; it is an error, not lowered, if memory is too small for it.
         progress: Called for every photo read and for every step.
         observers: Called with a `StepReport` after every step.
         attach: Openers of further observers, which are closed when training ends.
@@ -149,11 +139,7 @@ def train(
 
 
 def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunConfig:
-    """The configuration with which a run continues.
-
-    Raises:
-        UserError: Another one is asked for than the run began with.
-    """
+    """The configuration of a resumed run; raises `UserError` if another one is asked for than the run has."""
     if asked is None:
         return stored
     differing = differing_entries(stored, asked)
@@ -161,8 +147,8 @@ def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunCon
     if differing:
         changes = ", ".join(f"{path} is {old}, not {new}" for path, (old, new) in list(differing.items())[:3])
         raise UserError(
-            f"{folder} holds a run with other settings ({changes}), which resuming cannot change; leave these options "
-            "out, or choose another --output for a new run"
+            f"{folder} holds a run with other settings ({changes}), which resuming cannot change; leave these "
+            "options out, or choose another --output for a new run"
         )
     return asked
 
@@ -171,22 +157,13 @@ def read_scene(config: RunConfig, execution: ExecutionConfig, progress: Progress
     """Reads the scene of a configuration, and logs what is in it."""
     show = counter(progress, "reading photos")
     scene = load_scene(config.scene, config.data, image_cache=execution.image_cache, progress=show)
-    logger.info(
-        "%s: %d photos train, %d test, %s points",
-        scene.root,
-        len(scene.train_views),
-        len(scene.test_views),
-        f"{len(scene.points):,}",
-    )
+    train, test = len(scene.train_views), len(scene.test_views)
+    logger.info(f"{scene.root}: {train} photos train, {test} test, {len(scene.points):,} points")
     return scene
 
 
 def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
-    """The same run with another bound on the number of Gaussians.
-
-    Raises:
-        UserError: The bound is below 1.
-    """
+    """The configuration with another bound on the number of Gaussians, which must be 1 or more."""
     if max_gaussians < 1:
         raise UserError(f"--max-gaussians {max_gaussians}: must be 1 or more")
     density = replace(config.train.density, max_gaussians=max_gaussians)
@@ -194,11 +171,7 @@ def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
 
 
 def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> RunConfig:
-    """The run with a budget of Gaussians that fits into memory; a warning says where it was lowered.
-
-    Raises:
-        UserError: It cannot fit.
-    """
+    """The configuration with a budget of Gaussians that fits into memory; warns if it is lowered."""
     asked = config.train.density.max_gaussians
     budget, message = plan_budget(config.method, scene, asked, default_device(), explicit=explicit)
     if message is not None:
@@ -207,11 +180,7 @@ def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> R
 
 
 def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> TrainedRun:
-    """Trains to the end; where the GPU's memory runs out, once more from the newest checkpoint with less.
-
-    Raises:
-        UserError: Memory ran out twice.
-    """
+    """Trains to the end; if the GPU's memory runs out, once more from the newest checkpoint."""
     result = _train_unless_full(job, config, resume)
     if isinstance(result, TrainedRun):
         return result
@@ -226,18 +195,15 @@ def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> Train
     if isinstance(again, TrainedRun):
         return again
     raise UserError(
-        "the GPU's memory ran out again: continue with --resume and a lower --max-gaussians, or start again with a "
+        "the GPU's memory ran out again: continue with --resume and a lower --max-gaussians, or train again with a "
         "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
     )
 
 
 def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun | RunConfig:
-    """Trains to the end, or returns the configuration to try next.
+    """Trains to the end, or returns the configuration to try next; its trainer is freed by then.
 
-    What ran out of memory is freed when this returns: nothing else holds the trainer.
-
-    Raises:
-        UserError: Memory ran out on one of several processes: the others cannot be asked to try again.
+    If memory runs out on one of several processes, that is an error: the others cannot start again.
     """
     trainer: Trainer | None = None
     try:
@@ -271,13 +237,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
 def _train_to_end(
     job: _Job, config: RunConfig, trainer: Trainer, observers: Sequence[Observer]
 ) -> TrainedRun:
-    """Trains what is left, recording and saving.
-
-    Only whole steps are saved: whatever else breaks off a step leaves the newest checkpoint as it was.
-
-    Raises:
-        InterruptedTrainingError: A signal came; the last step is saved.
-    """
+    """Trains the remaining steps with records and checkpoints; only whole steps are saved."""
     team, folder, execution = job.team, job.folder, job.execution
     label = f"training {config.method}" + (f" on {team.size} processes" if team.size > 1 else "")
     alignment = job.scene.alignment
@@ -320,26 +280,21 @@ def _train_to_end(
         _save_last(saver, writer, trainer.step)
         result = _result(job, config, trainer)
         logger.info(
-            "%s: %d steps in %.1f min on %s, %s Gaussians -> %s",
-            label,
-            result.steps,
-            result.seconds / 60,
-            result.device,
-            f"{result.num_gaussians:,}",
-            folder,
+            f"{label}: {result.steps} steps in {result.seconds / 60:.1f} min on {result.device}, "
+            f"{result.num_gaussians:,} Gaussians -> {folder}"
         )
     return result
 
 
 def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:
-    """Saves the last step and returns when it is on the disk; see `Autosave.save_last`."""
+    """Saves the last step and waits until it is on the disk; see `Autosave.save_last`."""
     if not writer.finish():
         saver.saved_step = 0  # what was being written failed: the last step is to be written again
     saver.save_last(step, hurry=hurry)
 
 
 def _follow(job: _Job, config: RunConfig, trainer: Trainer) -> TrainedRun:
-    """Trains as a process other than rank 0, which alone writes and reports."""
+    """Trains on a rank other than 0, which alone writes and prints."""
     with StopOnSignal(trainer.team) as stop:
         try:
             trainer.run([stop])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     import viser
 
 ENLARGED = 10.0
-"""Covariances go to the browser in half precision, whose numbers are coarse below 6e-5. The aligned frame's unit is
-the photos' usual depth, and a Gaussian as wide as a pixel there has a variance of 1e-6. Splats are handed over this
-much larger, and their scene node shrinks them again."""
+"""Factor on the sizes of splats, which their scene node undoes: covariances are sent in half precision, which is
+coarse below 6e-5, and a Gaussian as wide as a pixel at the photos' median depth has a variance of 1e-6."""
 
 _HALF_MAX = 6e4
 
@@ -75,37 +74,17 @@ def splats_of(gaussians: Gaussians) -> Splats:
 def colors_from(
     means: Float[Tensor, "M 3"], sh: Float[Tensor, "M K 3"], position: Float[Tensor, " 3"], degree: int
 ) -> Float[np.ndarray, "M 3"]:
-    """Colours in [0, 1] as seen from a place: exact there, whatever way one looks.
-
-    Args:
-        means: Centres.
-        sh: Spherical harmonics.
-        position: The eye, in the same frame as the centres.
-        degree: Of the harmonics to use.
-    """
-    return sh_to_colors(means, sh, _eye_at(position.to(means)), degree=degree).clamp(0, 1).cpu().numpy()
+    """Colours in [0, 1] of Gaussians with these centres as seen from a position, by harmonics up to a degree."""
+    viewmat = torch.eye(4).to(means)
+    viewmat[:3, 3] = -position.to(means)
+    camera = Camera(viewmat, torch.eye(3).to(means), 1, 1)
+    return sh_to_colors(means, sh, camera, degree=degree).clamp(0, 1).cpu().numpy()
 
 
 @torch.no_grad()
 def distances_from(means: Float[Tensor, "M 3"], position: Float[Tensor, " 3"]) -> Float[np.ndarray, " M"]:
-    """How far the centres are from a place, world units."""
+    """Distances of the centres from a position, world units."""
     return (means - position.to(means)).norm(dim=1).cpu().numpy()
-
-
-def _eye_at(position: Float[Tensor, " 3"]) -> Camera:
-    viewmat = torch.eye(4).to(position)
-    viewmat[:3, 3] = -position
-    return Camera(viewmat, torch.eye(3).to(position), 1, 1)
-
-
-def as_viser(splats: Splats, colors: Float[np.ndarray, "M 3"]) -> dict[str, Any]:
-    """Arguments for viser's `add_gaussian_splats` and `set_gaussians`."""
-    return {
-        "centers": splats.centers,
-        "covariances": splats.covariances,
-        "rgbs": colors,
-        "opacities": splats.opacities,
-    }
 
 
 Paint = Literal["colour", "depth"]
@@ -113,13 +92,13 @@ NODE = "/splats"
 
 
 class SplatDisplay:
-    """Draws a subject's Gaussians in all browsers that look.
+    """Draws a subject's Gaussians in all clients.
 
-    viser's splats have one colour each, our Gaussians' colours depend on the direction. They are evaluated for one
-    eye, the camera that moved last, and are exact there whatever way it turns.
+    viser's splats have one colour each. Colours that depend on the direction are evaluated for one position, that
+    of the camera that moved last, and are exact there for all directions.
 
     Attributes:
-        eye: The place for which colours are evaluated, aligned frame.
+        eye: The position for which colours are evaluated, aligned frame.
         paint: What colours show.
     """
 
@@ -147,7 +126,13 @@ class SplatDisplay:
         if self._splats is None or self._sh is None:
             return
         colors = self._colors(self._splats, self._sh)
-        arguments = as_viser(self._splats, colors)
+        splats = self._splats
+        arguments = {
+            "centers": splats.centers,
+            "covariances": splats.covariances,
+            "rgbs": colors,
+            "opacities": splats.opacities,
+        }
         if self._handle is None:
             self._handle = self._server.scene.add_gaussian_splats(NODE, **arguments, scale=1 / ENLARGED)
         else:

@@ -13,9 +13,8 @@ Job = Callable[[], None]
 
 
 class Jobs:
-    """Requests in the order in which their kinds were first asked for.
+    """A queue in which a job replaces an older one of its kind: a slider sends more values than can be shaded.
 
-    A slider sends more values than can be shaded; a request replaces an older one of its kind that still waits.
     All work on the method goes through one such queue and is done by one thread: a worker's, or the trainer's.
     """
 
@@ -25,60 +24,53 @@ class Jobs:
         self._closed = False
 
     def put(self, kind: str, job: Job) -> None:
-        """Asks for work; does nothing once the queue is closed."""
+        """Adds a job, unless the queue is closed."""
         with self._changed:
             if not self._closed:
                 self._waiting[kind] = job
                 self._changed.notify()
 
     def take(self, *, wait: bool) -> Job | None:
-        """The next job.
-
-        Args:
-            wait: Until there is one; None then means that the queue was closed.
-        """
+        """The next job, None if there is none; with `wait`, only once the queue is closed."""
         with self._changed:
             while wait and not self._waiting and not self._closed:
                 self._changed.wait()
             return self._waiting.popitem(last=False)[1] if self._waiting else None
 
     def close(self) -> None:
-        """Ends the queue: what waits is dropped, and whoever waits for work gets none."""
+        """Closes the queue and drops its jobs."""
         with self._changed:
             self._closed = True
             self._waiting.clear()
             self._changed.notify_all()
 
 
-def work_off(jobs: Jobs) -> None:
-    """Does jobs as they come, until the queue is closed."""
-    while (job := jobs.take(wait=True)) is not None:
-        job()
-
-
 def start_worker(jobs: Jobs) -> threading.Thread:
-    """Works off the queue on a thread of its own.
+    """Does jobs on a thread of its own, which ends after the present job once the queue is closed.
 
-    It ends when the queue is closed and the job in hand is done. A program must wait for that: a thread that Python
-    stops in the middle of a kernel takes the whole process with it.
+    A program must join it: a thread that Python stops in the middle of a kernel crashes the process.
     """
-    worker = threading.Thread(target=work_off, args=(jobs,), name="wildgs-viewer")
+
+    def work() -> None:
+        while (job := jobs.take(wait=True)) is not None:
+            job()
+
+    worker = threading.Thread(target=work, name="wildgs-viewer")
     worker.start()
     return worker
 
 
 SHARE = 0.03
-"""Part of the time that the viewer may take. It promises 5% at most; the rest covers what viser's own thread needs
-to send what was made here."""
+"""Share of the time that jobs may take; with viser's own thread, which sends their results, the viewer stays
+below 5%."""
 UPDATE_SECONDS = 3.0
 
 
 class TrainingTurns:
-    """An observer of training that does the viewer's work between steps, and rests after it.
+    """An observer of training that does the viewer's jobs between steps, on the trainer's thread.
 
-    Parameters may only be read between steps, so the work is done on the trainer's thread. Work that took t seconds
-    is followed by a rest of t (1 - share) / share, so its part of the time never grows beyond the share, however
-    much the people at the screen ask for; they wait longer instead.
+    A job that took t seconds is followed by a rest of t (1 - share) / share, so that jobs never take more than that
+    share of the time, whatever clients request.
     """
 
     def __init__(
@@ -91,15 +83,15 @@ class TrainingTurns:
         every: float = UPDATE_SECONDS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Sets up `TrainingTurns`.
+        """Sets what to do and when.
 
         Args:
-            jobs: Work that was asked for.
-            watched: Whether any browser is connected.
-            update: Asks for the present step to be shown.
-            share: Part of the time that work may take.
-            every: Seconds between updates, at least.
-            clock: Seconds.
+            jobs: The queue.
+            watched: Whether any client is connected.
+            update: Queues an update to the present step.
+            share: Share of the time that jobs may take.
+            every: Least time between updates, seconds.
+            clock: Time in seconds.
         """
         self.seconds = 0.0
         self._jobs, self._watched, self._update = jobs, watched, update
@@ -107,7 +99,7 @@ class TrainingTurns:
         self._rest_until = self._next_update = clock()
 
     def __call__(self, report: StepReport) -> None:
-        """Does one piece of work, if its time has come."""
+        """Does one job, if its time has come."""
         now = self._clock()
         if now < self._rest_until or not self._watched():
             return

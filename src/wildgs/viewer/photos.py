@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import viser
 
 LONG_SIDE = 480
-"""Pictures are computed no larger: they are shown small."""
+"""Long side of the pictures, pixels."""
 
 HIDDEN_TINT = np.array([230.0, 40.0, 40.0])
 Picture = UInt8[np.ndarray, "H W 3"]
@@ -60,17 +60,18 @@ def compare(subject: Subject, view: View, look: Look) -> Comparison:
     """Renders a photo's viewpoint under a light."""
     shrink = min(1.0, LONG_SIDE / max(view.camera.width, view.camera.height))
     width, height = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
-    photo = _resized(view.read_photo(), width, height)
+    pixels = _resized(view.read_photo().permute(2, 0, 1).float(), width, height)
+    photo = pixels.permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8)
     render, rendering = subject.render(view.camera.resized(width, height), look)
     depth = torch.where(rendering.alpha > 0.5, rendering.depth, 0.0)
     visibility = subject.visibility(view)
+    if visibility is not None:
+        visibility = _resized(visibility[None], width, height)[0]
     return Comparison(
         name=view.name,
         photo=photo.numpy(),
         render=render.numpy(),
-        mask=None
-        if visibility is None
-        else tint_hidden(photo.numpy(), _resized_mask(visibility, width, height)),
+        mask=None if visibility is None else tint_hidden(photo.numpy(), visibility.numpy()),
         depth=color_depth(depth.double().cpu().numpy()),
         psnr=psnr(render, photo),
         light=look.name,
@@ -84,17 +85,9 @@ def tint_hidden(photo: Picture, visibility: Float[np.ndarray, "H W"]) -> Picture
     return ((1 - 0.8 * hidden) * grey + 0.8 * hidden * HIDDEN_TINT).round().astype(np.uint8)
 
 
-def _resized(photo: UInt8[Tensor, "H W 3"], width: int, height: int) -> UInt8[Tensor, "h w 3"]:
-    values = photo.permute(2, 0, 1)[None].float()
-    small = torch.nn.functional.interpolate(values, (height, width), mode="bilinear", antialias=True)
-    return small[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8)
-
-
-def _resized_mask(mask: Float[Tensor, "H W"], width: int, height: int) -> Float[np.ndarray, "h w"]:
-    small = torch.nn.functional.interpolate(
-        mask[None, None], (height, width), mode="bilinear", antialias=True
-    )
-    return small[0, 0].numpy()
+def _resized(channels: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C h w"]:
+    options = {"mode": "bilinear", "antialias": True}
+    return torch.nn.functional.interpolate(channels[None], (height, width), **options)[0]
 
 
 PARENT = "/photos"
@@ -115,13 +108,13 @@ class PhotoPanel:
         gallery: Gallery,
         visited: Callable[[View], None],
     ) -> None:
-        """Adds the controls to the container that is open.
+        """Adds the controls to the open container.
 
         Args:
-            server: The viewer's.
+            server: The viewer's server.
             views: All photos.
             gallery: Those that get frustums.
-            visited: Called, on a thread of viser's, when someone stands at a photo's viewpoint.
+            visited: Called on a thread of viser when a client moves to a photo's viewpoint.
         """
         self._server, self._gallery, self._visited = server, gallery, visited
         self._by_label = {printable(view.name): view for view in views}
@@ -172,7 +165,7 @@ class PhotoPanel:
             self._frustums[view.name] = frustum
 
     def visit(self, client: viser.ClientHandle | None, view: View) -> None:
-        """Puts a browser's camera where a photo was taken, and has the two compared."""
+        """Moves a client's camera to a photo's viewpoint, and requests the comparison."""
         if client is not None:
             stand_at(client, view)
         self.current = view
@@ -200,7 +193,7 @@ class PhotoPanel:
 
 
 def stand_at(client: viser.ClientHandle, view: View) -> None:
-    """Moves a browser's camera to a photo's, opened so far that the whole photo is in the window."""
+    """Moves a client's camera to a photo's, with a field of view in which the whole photo is visible."""
     pose = pose_of(view.camera)
     with client.atomic():
         client.camera.position = pose.position

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,7 +15,7 @@ from wildgs.exporters.video import write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.camera_file import write_camera_path
 from wildgs.geometry.trajectory import interpolate
-from wildgs.viewer.cameras import Pose, ViserCamera, camera_of
+from wildgs.viewer.cameras import Pose, camera_of
 from wildgs.viewer.lighting import LightDesk
 from wildgs.viewer.markup import escape
 from wildgs.viewer.subject import Subject
@@ -49,11 +49,7 @@ class VideoOrder:
 
 
 class RecordingPanel:
-    """The controls of a camera path, and its keyframes as frustums in the scene.
-
-    Attributes:
-        folder: Where videos go.
-    """
+    """The controls of a camera path, and its keyframes as frustums in the scene."""
 
     def __init__(
         self,
@@ -61,12 +57,12 @@ class RecordingPanel:
         folder: Path | None,
         ordered: Callable[[viser.ClientHandle | None], None],
     ) -> None:
-        """Adds the controls to the container that is open.
+        """Adds the controls to the open container.
 
         Args:
-            server: The viewer's.
-            folder: Where videos go; None while none can be made (training).
-            ordered: Called, on a thread of viser's, with the browser that wants the video.
+            server: The viewer's server.
+            folder: For videos; None while none can be made (training).
+            ordered: Called on a thread of viser, with the client that asks for the video.
         """
         self.folder = folder
         self._server, self._ordered = server, ordered
@@ -88,7 +84,7 @@ class RecordingPanel:
         self._line = gui.add_html("")
         self.tell(self._describe())
 
-    def add(self, camera: ViserCamera) -> None:
+    def add(self, camera: Any) -> None:
         """Adds a keyframe; a path that is full stays as it is."""
         if len(self._poses) >= MAX_VIEWS:
             self.tell(f"A path has at most {MAX_VIEWS} views.")
@@ -116,11 +112,7 @@ class RecordingPanel:
         self.tell(self._describe())
 
     def order(self) -> VideoOrder:
-        """The video as the controls describe it.
-
-        Raises:
-            UserError: The path has too few views, or the video would be too long or too large.
-        """
+        """The video as the controls describe it; raises `UserError` if it has too few views or is too long."""
         if len(self._poses) < MIN_VIEWS:
             raise UserError(
                 "a path needs at least two views: add this view, fly somewhere else, and add that one"
@@ -153,27 +145,24 @@ FPS = 30.0
 
 
 def make_film(
-    subject: Subject, desk: LightDesk, order: VideoOrder, file: Path, told: Callable[[int, int], bool]
+    subject: Subject, desk: LightDesk, order: VideoOrder, file: Path, progress: Callable[[int, int], bool]
 ) -> Path:
-    """Renders the way through an order's keyframes.
+    """Renders a video along the keyframes, and writes the camera file beside it (the same name, .json).
 
     Args:
         subject: The scene.
         desk: Its light.
-        order: What the video shall be.
-        file: The video; the camera file gets its name with the ending .json.
-        told: Called with (frames done, frames in all) after every frame; False ends the work.
-
-    Returns:
-        The video.
+        order: Settings of the video.
+        file: The video.
+        progress: Called with (frames done, frames in all) after every frame; False stops.
 
     Raises:
-        UserError: The video cannot be written, or `told` ended it. Nothing is left then.
+        UserError: The video cannot be written, or `progress` stopped it. No file is left then.
     """
     height = order.keyframes[0].height
     width = 2 * round(height * ASPECT / 2)
     cameras = interpolate(order.keyframes, max(2, round(order.seconds * FPS)), width, height)
-    write_frames(file, _frames(subject, desk, order.relight, cameras, told), (width, height), FPS)
+    write_frames(file, _frames(subject, desk, order.relight, cameras, progress), (width, height), FPS)
     write_camera_path(file.with_suffix(".json"), cameras, fps=FPS)
     return file
 
@@ -187,7 +176,11 @@ def free_name(folder: Path) -> Path:
 
 
 def _frames(
-    subject: Subject, desk: LightDesk, relight: bool, cameras: list[Camera], told: Callable[[int, int], bool]
+    subject: Subject,
+    desk: LightDesk,
+    relight: bool,
+    cameras: list[Camera],
+    progress: Callable[[int, int], bool],
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     look = desk.look(subject)
     for number, camera in enumerate(cameras):
@@ -195,5 +188,5 @@ def _frames(
             look = replace(desk, amount=number / (len(cameras) - 1)).look(subject)
         picture, _ = subject.render(camera, look)
         yield picture.numpy()
-        if not told(number + 1, len(cameras)):
+        if not progress(number + 1, len(cameras)):
             raise UserError("the video was not finished: the viewer was closed")

@@ -1,4 +1,4 @@
-"""`wildgs.view`, and the viewer beside a training: a page opened, kept up to date and closed."""
+"""`wildgs.view`, and the viewer of a training: the server, its address, and the life of a page."""
 
 from __future__ import annotations
 
@@ -34,11 +34,7 @@ REMEDY = "the viewer needs viser: pip install 'wildgs[viewer]'"
 
 
 def open_server(config: ServerConfig, title: str) -> GuardedServer:
-    """Starts an empty viewer page.
-
-    Args:
-        config: Where it listens.
-        title: Stands above the controls.
+    """Starts an empty viewer page with a title.
 
     Raises:
         UserError: viser is not installed, the address is not one of this machine's, or sharing failed.
@@ -67,7 +63,7 @@ def open_server(config: ServerConfig, title: str) -> GuardedServer:
 
 
 def address(server: GuardedServer, config: ServerConfig) -> str:
-    """What to type into a browser on this machine: the address with the viewer's token."""
+    """The address for a browser on this machine, with the viewer's token."""
     host = LOCAL if config.host in ("0.0.0.0", "::", "") else config.host
     local = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
     return f"{local}/{server.access.token}/"
@@ -80,11 +76,7 @@ def public_address(server: GuardedServer, config: ServerConfig) -> str | None:
 
 
 def import_viser():
-    """Imports viser, which is an optional dependency.
-
-    Raises:
-        UserError: It is not installed; the message says how to get it.
-    """
+    """Imports viser, an optional dependency; raises `UserError` if it is not installed."""
     try:
         return importlib.import_module("viser")
     except ModuleNotFoundError as error:
@@ -94,7 +86,7 @@ def import_viser():
 
 
 def _check_address(config: ServerConfig) -> None:
-    """Refuses addresses that viser would try on a thousand ports, one after the other."""
+    """Rejects an impossible address, for which viser would try a thousand ports."""
     if not 0 <= config.port <= 65535:
         raise UserError(f"--port {config.port}: ports are 0 to 65535, 0 for any free one")
     try:
@@ -124,7 +116,7 @@ class OpenViewer:
     """
 
     def __init__(self, viewer: Viewer, urls: Sequence[str]) -> None:
-        """Sets up an `OpenViewer`; `view` opens one."""
+        """Use `view` to open one."""
         self.viewer, self.urls = viewer, tuple(urls)
         self._worker: threading.Thread | None = None
 
@@ -195,22 +187,16 @@ def view(
 
 
 def addresses(server: GuardedServer, config: ServerConfig) -> list[str]:
-    """What to type into a browser: on this machine, and anywhere where the page is shared."""
+    """The addresses of the page: on this machine, and the public one if the page is shared."""
     found = (address(server, config), public_address(server, config))
     return [url for url in found if url is not None]
 
 
 class TrainingWindow:
-    """A page beside a training: it shows the training while it runs, and what was trained afterwards."""
+    """A page that shows a training while it runs, and its result afterwards."""
 
     def __init__(self, server: ServerConfig, title: str, announce: Callable[[str], None]) -> None:
-        """Sets up a `TrainingWindow`.
-
-        Args:
-            server: Where the page is reached.
-            title: Stands above the controls.
-            announce: Called with a line that says where the page is.
-        """
+        """Takes the page's address and title, and a function that prints where the page is."""
         self._config, self._title, self._announce = server, title, announce
         self._open: OpenViewer | None = None
         self._status = ""
@@ -247,7 +233,7 @@ class TrainingWindow:
         self._status = f"trained {trainer.step:,} steps, {len(trainer.method.gaussians):,} Gaussians"
 
     def stay(self) -> None:
-        """Keeps showing what was trained, until Ctrl-C."""
+        """Keeps showing the result, until Ctrl-C."""
         if self._open is not None:
             self._open.viewer.set_status(self._status)
             self._open.viewer.ask_for_update()
