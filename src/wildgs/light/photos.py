@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,10 +13,9 @@ from torch import Tensor
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.method import Method
-from wildgs.scene import View, find_view, match_view
+from wildgs.progress import Counter
+from wildgs.scene import View
 from wildgs.scene.scene import to_unit
-
-__all__ = ["cover", "encode_photo", "encode_picture", "encode_view", "find_view", "match_view"]
 
 
 @torch.no_grad()
@@ -58,9 +57,7 @@ def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Ten
 
 
 MAX_PHOTOS = 200
-"""Photos that are looked at; of larger collections as many, evenly spread over the names."""
-
-Progress = Callable[[int, int], None]
+"""Most photos that are encoded; of larger collections as many, evenly spread over the names."""
 
 
 @dataclass(frozen=True)
@@ -84,14 +81,8 @@ class Atlas:
 
 
 @torch.no_grad()
-def make_atlas(method: Method, views: Sequence[View], progress: Progress | None = None) -> Atlas:
-    """Encodes the training photos, `MAX_PHOTOS` at most.
-
-    Args:
-        method: The trained method.
-        views: Training views, at least one.
-        progress: Called with (photos encoded, photos in all).
-    """
+def make_atlas(method: Method, views: Sequence[View], progress: Counter | None = None) -> Atlas:
+    """Encodes the training photos (at least one), `MAX_PHOTOS` at most."""
     count = min(len(views), MAX_PHOTOS)
     chosen = tuple(views[index * len(views) // count] for index in range(count))
     global_embeddings: list[Tensor] = []

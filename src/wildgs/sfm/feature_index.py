@@ -1,15 +1,14 @@
-"""What a new photo is localised against: SIFT descriptors of a scene's triangulated points.
+"""An index of SIFT descriptors of a scene's triangulated points, in which new photos are localised.
 
-Features are detected again in the scene's photos, and one that lies where a photo observes a point stands for that
-point. Cameras, points, their observations and the photos are all that is needed: a run carries them
-(`wildgs.scene.carried`), and no database of the reconstruction has to be kept.
+Features are detected in the scene's photos, and those at the observation of a point describe the point. This needs
+only what a run carries (`wildgs.scene.carried`): cameras, points, observations and photos, and no database of the
+reconstruction.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.files import check_regular, written_aside
+from wildgs.progress import Counter
 from wildgs.scene import Scene, View
 from wildgs.sfm.mapping import quiet
 
@@ -35,14 +35,12 @@ MAX_IMAGE_SIZE = 1600
 """Features are sought at no more than this many pixels on the long side."""
 
 SAME_PLACE = 0.0025
-"""A feature and an observation are one within this share of the photo's long side (2 pixels of 800)."""
-
-Progress = Callable[[int, int], None]
+"""Largest distance of a feature from an observation of the same point, as a share of the photo's long side."""
 
 
 @dataclass(frozen=True)
 class FeatureIndex:
-    """Triangulated points by what they look like.
+    """Triangulated points with their descriptors.
 
     Attributes:
         descriptors: SIFT, as COLMAP stores it (root of L1-normalised, norm about 512).
@@ -56,7 +54,7 @@ class FeatureIndex:
 
 
 def load_feature_index(
-    scene: Scene, cache: Path | None = None, progress: Progress | None = None
+    scene: Scene, cache: Path | None = None, progress: Counter | None = None
 ) -> FeatureIndex:
     """The feature index of a scene, from the cache where that is of this scene.
 
@@ -97,7 +95,7 @@ def _read_cache(file: Path, state: str) -> FeatureIndex | None:
         return None
 
 
-def _index_features(scene: Scene, progress: Progress | None) -> FeatureIndex:
+def _index_features(scene: Scene, progress: Counter | None) -> FeatureIndex:
     counts = torch.bincount(scene.observations[:, 0].long(), minlength=len(scene.views))
     chosen = counts.argsort(descending=True, stable=True)[:MAX_PHOTOS]
     chosen = chosen[counts[chosen] > 0].sort().values.tolist()
@@ -174,7 +172,7 @@ def match_features(
 
     Args:
         features: Descriptors of a new photo.
-        index: What is sought.
+        index: The points that are sought.
         ratio: Largest distance to the best point, relative to the best of all other points.
 
     Returns:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,10 @@ import numpy as np
 import pycolmap
 
 from wildgs.errors import UserError
+from wildgs.progress import Progress
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.pairs import Pairing, choose_pairs
 from wildgs.sfm.upright import WorkingCopy
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and of how much (0 = not known)."""
 
 EXTRACTION_BATCH = 16
 MATCHING_BLOCK = 50
@@ -26,7 +24,7 @@ MATCHING_BLOCK = 50
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders and files beside the output while the work continues."""
+    """Temporary folders and files beside the output."""
 
     root: Path
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -127,7 +127,7 @@ class SplatDisplay:
             return
         colors = self._colors(self._splats, self._sh)
         splats = self._splats
-        arguments = {
+        arguments: dict[str, Any] = {
             "centers": splats.centers,
             "covariances": splats.covariances,
             "rgbs": colors,
