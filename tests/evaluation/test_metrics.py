@@ -6,7 +6,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.evaluation.metrics import MAX_PSNR, MaskScore, psnr, structural_similarity, to_8bit
+from wildgs.evaluation.metrics import (
+    MAX_PSNR,
+    MaskScore,
+    detail,
+    landmark_pixels,
+    psnr,
+    structural_similarity,
+    to_8bit,
+)
 
 
 def separable_ssim_map(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -122,3 +130,44 @@ def test_without_transients_there_is_nothing_to_find():
     score.add(as_map([0.9, 0.8]), torch.tensor([[True, True]]))
     assert score.average_precision is None
     assert score.iou is None
+
+
+@pytest.fixture
+def texture() -> torch.Tensor:
+    noise = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(1))
+    return (60 + 130 * noise).permute(1, 2, 0).to(torch.uint8)
+
+
+def test_detail_of_the_truth_itself_is_whole_whatever_its_light(texture):
+    recoloured = (texture.float() * torch.tensor([0.5, 0.7, 0.9]) + 20).round().to(torch.uint8)
+    for render in (texture, recoloured):
+        assert detail(render, texture) == pytest.approx((1, 1), abs=0.01)
+
+
+def test_blur_takes_energy_and_noise_takes_correlation(texture):
+    image = texture.permute(2, 0, 1)[None].float()
+    blurred = (
+        torch.nn.functional.avg_pool2d(image, 3, stride=1, padding=1)[0].permute(1, 2, 0).to(torch.uint8)
+    )
+    assert detail(blurred, texture).energy < 0.8
+    other = texture.flip(0)
+    assert abs(detail(other, texture).correlation) < 0.1
+    flat = torch.full_like(texture, 9)
+    assert detail(flat, flat) == (None, None)
+
+
+def test_detail_counts_kept_pixels_alone(texture):
+    keep = torch.zeros(texture.shape[:2], dtype=torch.bool)
+    keep[:, :40] = True
+    spoilt = texture.clone()
+    spoilt[:, 48:] = 0  # beyond the reach of the filter
+    assert detail(spoilt, texture, keep) == pytest.approx((1, 1), abs=1e-3)
+
+
+def test_the_landmark_is_what_lies_near_observations():
+    assert landmark_pixels(torch.full((19, 2), 5.0), 100, 200) is None
+    near = landmark_pixels(torch.full((25, 2), 50.5), 100, 200)
+    assert near is not None
+    assert near[50, 50]
+    assert not near[50, 57]
+    assert near.sum() == pytest.approx(math.pi * 6**2, rel=0.1)

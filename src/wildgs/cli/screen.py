@@ -31,6 +31,14 @@ if TYPE_CHECKING:
 
 LINE_SECONDS = 10.0
 REFRESH_STEPS = 10
+_SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips", 3))
+_PARTS = (
+    ("PSNR landmark", "landmark", 2),
+    ("elsewhere", "elsewhere", 2),
+    ("detail", "detail_energy", 2),
+    ("correlation", "detail_correlation", 3),
+)
+"""Columns of the printed tables: header, key of the means in `metrics.json`, digits."""
 
 
 class Forgiving:
@@ -188,24 +196,33 @@ def print_finished(finished: FinishedRun) -> None:
 
 
 def print_scores(runs: Mapping[str, Scores]) -> None:
-    """Prints one table over runs and protocols, then what could not be computed."""
-    table = Table("run", "protocol", "PSNR", "SSIM", "LPIPS", "Gaussians", "frames/s")
+    """Prints scores, what can be measured without truth, and what could not be computed."""
+    table = Table("run", "protocol", *(header for header, _, _ in _SCORES), "Gaussians", "frames/s")
+    parts = Table("run", "protocol", *(header for header, _, _ in _PARTS), "static hidden", "worst photo")
     notes: dict[str, None] = {}
     for name, protocols in runs.items():
         for protocol, metrics in protocols.items():
             mean = metrics["mean"]
-            cells = [_number(mean["psnr"], 2), _number(mean["ssim"], 3), _number(mean["lpips"], 3)]
+            cells = [_number(mean[key], digits) for _, key, digits in _SCORES]
             table.add_row(
                 name, protocol, *cells, f"{metrics['num_gaussians']:,}", _number(metrics["render_fps"], 0)
             )
+            cells = [_number(mean.get(key), digits) for _, key, digits in _PARTS]
+            cells += [_percent(metrics.get(key)) for key in ("static_hidden", "static_hidden_worst")]
+            parts.add_row(name, protocol, *cells)
             notes |= dict.fromkeys(metrics.get("notes", ()))
     console.print(table)
+    console.print(parts)
     for note in notes:
         console.print(note, style="dim")
 
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2%}"
 
 
 def _bar() -> Progress:

@@ -84,6 +84,10 @@ _COLUMNS = (
     _Column("paper", _paper("ssim", 4)),
     _Column("LPIPS ↓", _ours("lpips", 4)),
     _Column("paper", _paper("lpips", 4)),
+    _Column("landmark ↑", _ours("landmark", 2)),
+    _Column("elsewhere ↑", _ours("elsewhere", 2)),
+    _Column("detail", _ours("detail_energy", 2)),
+    _Column("detail corr. ↑", _ours("detail_correlation", 3)),
     _Column("training, min", _ours("train_seconds", 1, 60.0)),
     _Column("paper", _paper("train_seconds", 1, 60.0)),
     _Column("frames/s", _ours("render_fps", 1)),
@@ -91,6 +95,8 @@ _COLUMNS = (
     _Column("Gaussians", _ours("num_gaussians", 0)),
     _Column("mask AP ↑", _ours("mask_ap", 3)),
     _Column("mask IoU ↑", _ours("mask_iou", 3)),
+    _Column("static hidden, % ↓", _ours("static_hidden", 2, 0.01)),
+    _Column("worst photo, %", _ours("static_hidden_worst", 1, 0.01)),
 )
 
 
@@ -103,6 +109,21 @@ def legend(rows: Sequence[Row]) -> list[str]:
         lines.append("vs Wild-GS: difference in PSNR (dB), run by run with the same seed.")
     if any(row.quantities.get("mask_ap") is not None for row in rows):
         lines.append("Masks: average precision and IoU of transients in training photos, all pixels pooled.")
+    if any(row.quantities.get("landmark") is not None for row in rows):
+        lines.append(
+            "Landmark and elsewhere: PSNR (dB) within 3% of the photo's longer side of triangulated observations, "
+            "and of all other pixels (sky, ground, passers-by)."
+        )
+    if any(row.quantities.get("detail_energy") is not None for row in rows):
+        lines.append(
+            "Detail: standard deviation of high frequencies over the truth's (1 is best), and their correlation "
+            "with the truth's."
+        )
+    if any(row.quantities.get("static_hidden") is not None for row in rows):
+        lines.append(
+            "Static hidden: share of observations of points that three photos or more triangulated at which the "
+            "mask of the training photo hides the landmark, over all photos, and in the worst one."
+        )
     lines.append(_lpips_line(rows))
     devices = ", ".join(sorted({row.device for row in rows if row.device}))
     if devices:

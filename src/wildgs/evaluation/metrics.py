@@ -1,9 +1,13 @@
-"""Scores of renders (PSNR, SSIM) on pictures rounded to 8 bits, and of transient masks (AP, IoU)."""
+"""Scores of renders (PSNR, SSIM, detail) on pictures rounded to 8 bits, and of transient masks (AP, IoU)."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
 from wildgs.losses.ssim import ssim_map
@@ -11,6 +15,13 @@ from wildgs.losses.ssim import ssim_map
 _BINS = 1 << 16
 MAX_PSNR = 100.0
 """PSNR of equal pictures in dB, so that means stay finite."""
+LANDMARK_REACH = 0.03
+"""Pixels within this share of the longer side of a triangulated observation belong to the landmark."""
+LEAST_OBSERVATIONS = 20
+"""Photos with fewer observations do not tell where the landmark is."""
+LEAST_LANDMARK_PIXELS = 50
+DETAIL_SIGMA = 1.5
+"""Standard deviation of the Gaussian, in pixels, that takes low frequencies out."""
 
 
 def to_8bit(picture: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
@@ -55,6 +66,67 @@ def structural_similarity(
     """
     similarity = ssim_map(render.double() / 255, truth.double() / 255)
     return float((similarity if keep is None else similarity[keep]).mean())
+
+
+def landmark_pixels(observed: Float[Tensor, "K 2"], height: int, width: int) -> Bool[Tensor, "H W"] | None:
+    """Which pixels show the landmark: those close to a triangulated observation.
+
+    Args:
+        observed: Observations of the photo (x, y), pixels.
+        height: Of the photo.
+        width: Of the photo.
+
+    Returns:
+        None for a photo with fewer than `LEAST_OBSERVATIONS` observations.
+    """
+    if len(observed) < LEAST_OBSERVATIONS:
+        return None
+    away = np.ones((height, width), dtype=bool)
+    x, y = observed.cpu().long().unbind(1)
+    away[y, x] = False
+    distance = np.asarray(distance_transform_edt(away))
+    return torch.from_numpy(distance < LANDMARK_REACH * max(height, width))
+
+
+class Detail(NamedTuple):
+    """High frequencies of a render's luminance against the truth's.
+
+    Attributes:
+        energy: Their standard deviation over the truth's: below 1 the render is blurred, above 1 it is noisy.
+        correlation: Of the two; 1 where the detail is the truth's own.
+    """
+
+    energy: float | None
+    correlation: float | None
+
+
+def detail(
+    render: UInt8[Tensor, "H W 3"], truth: UInt8[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None = None
+) -> Detail:
+    """Compares high frequencies, after the affine colour map that fits the render best to the truth.
+
+    Args:
+        render: Picture to score.
+        truth: Ground truth.
+        keep: Pixels that count; None for all.
+
+    Returns:
+        Nones where one of the pictures has no high frequencies.
+    """
+    chosen = np.ones(render.shape[:2], dtype=bool) if keep is None else keep.cpu().numpy()
+    drawn, true = (picture.cpu().numpy().astype(np.float64) / 255 for picture in (render, truth))
+    with_offset = np.concatenate([drawn, np.ones_like(drawn[..., :1])], axis=2)
+    color_map = np.linalg.lstsq(with_offset[chosen], true[chosen], rcond=None)[0]
+    first, second = (_high_frequencies(picture)[chosen] for picture in (with_offset @ color_map, true))
+    spread = float(first.std()), float(second.std())
+    if min(spread) < 1e-9:
+        return Detail(None, None)
+    return Detail(spread[0] / spread[1], float((first * second).mean()) / (spread[0] * spread[1]))
+
+
+def _high_frequencies(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    grey = picture.mean(axis=2)
+    return grey - gaussian_filter(grey, DETAIL_SIGMA)
 
 
 class MaskScore:

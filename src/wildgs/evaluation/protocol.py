@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,24 +16,48 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.lpips import LPIPS, MIN_SIDE, load_lpips
-from wildgs.evaluation.metrics import MaskScore, psnr, structural_similarity, to_8bit
+from wildgs.evaluation.metrics import (
+    LEAST_LANDMARK_PIXELS,
+    MaskScore,
+    detail,
+    landmark_pixels,
+    psnr,
+    structural_similarity,
+    to_8bit,
+)
+from wildgs.evaluation.photos import PhotoFit, inference, summarize_photos
 from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
 from wildgs.model.method import Method
-from wildgs.scene.scene import Scene, View
+from wildgs.scene.scene import Scene, View, observed_pixels
 
 Protocol = Literal["full", "half"]
-METRICS = ("psnr", "ssim", "lpips")
+METRICS = ("psnr", "ssim", "lpips", "landmark", "elsewhere", "detail_energy", "detail_correlation")
 _TIMED_FRAMES = 15
 
 
 @dataclass(frozen=True)
 class ImageScore:
-    """Scores of one view; None if a metric could not be computed."""
+    """Scores of one view; None if a metric could not be computed.
+
+    Attributes:
+        name: Of the photo.
+        psnr: PSNR, dB.
+        ssim: SSIM.
+        lpips: LPIPS.
+        landmark: PSNR of the pixels near triangulated observations, dB, see `landmark_pixels`.
+        elsewhere: PSNR of the others (sky, ground, passers-by), dB.
+        detail_energy: See `wildgs.evaluation.metrics.Detail`.
+        detail_correlation: Likewise.
+    """
 
     name: str
-    psnr: float | None
-    ssim: float | None
-    lpips: float | None
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+    landmark: float | None = None
+    elsewhere: float | None = None
+    detail_energy: float | None = None
+    detail_correlation: float | None = None
 
 
 @dataclass
@@ -58,6 +81,7 @@ def evaluate(
     train_seconds: float | None = None,
     lpips_folder: Path | None = None,
     mask_threshold: float = 0.5,
+    photos: Sequence[PhotoFit] = (),
     on_view: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Renders and scores the held-out views; writes ``eval/<protocol>/<stem>.png`` and ``metrics.json``.
@@ -70,7 +94,8 @@ def evaluate(
     pixels that the mask of the view ignores are excluded from PSNR and SSIM, and replaced by the photo for LPIPS.
     Renders are rounded to 8 bits first.
 
-    In `full`, predicted masks of training photos are scored too, if the scene has ground truth masks.
+    In `full`, predicted masks of training photos are scored too: against ground truth masks if the scene has some,
+    and by the share of static observations that they hide (`photos`).
 
     Args:
         method: A trained method.
@@ -81,6 +106,7 @@ def evaluate(
         train_seconds: Training time, for the record.
         lpips_folder: Folder of LPIPS weights; by default as in `load_lpips`.
         mask_threshold: Threshold Th for the intersection over union of masks.
+        photos: What `inspect_photos` found of training photos.
         on_view: Called with the name of each finished view.
 
     Returns:
@@ -97,13 +123,14 @@ def evaluate(
     device = method.gaussians.means.device
     lpips = lpips.to(device) if lpips is not None else None
     paths = picture_paths(view.name for view in scene.test_views)
+    observed = observed_pixels(scene, least_photos=1, split="test")
     scores: list[ImageScore] = []
-    with _inference(method):
+    with inference(method):
         for view in scene.test_views:
             sh = _shade(method, view, protocol, device)
             render = _render(method, view, sh, notes)
             write_picture(folder / paths[view.name], render)
-            scores.append(_score_view(view, render, protocol, lpips, notes))
+            scores.append(_score_view(view, render, protocol, observed, lpips, notes))
             if on_view is not None:
                 on_view(view.name)
         fps = _measure_fps(method, sh, scene.test_views, device)
@@ -122,20 +149,10 @@ def evaluate(
     }
     if masks is not None:
         content["masks"] = masks.as_dict()
+    if protocol == "full":
+        content |= summarize_photos(photos)
     write_json(folder / "metrics.json", content)
     return content
-
-
-@contextmanager
-def _inference(method: Method) -> Iterator[None]:
-    # Not inference_mode: tensors that a method caches must stay usable in training.
-    training = method.training
-    method.eval()
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        method.train(training)
 
 
 def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
@@ -156,30 +173,58 @@ def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Note
 
 
 def _score_view(
-    view: View, render: UInt8[Tensor, "H W 3"], protocol: Protocol, lpips: LPIPS | None, notes: _Notes
+    view: View,
+    render: UInt8[Tensor, "H W 3"],
+    protocol: Protocol,
+    observed: Mapping[str, Float[Tensor, "_ 2"]],
+    lpips: LPIPS | None,
+    notes: _Notes,
 ) -> ImageScore:
     clean = view.read_clean()
     truth = (view.read_photo() if clean is None else clean).to(render.device)
     keep = _read_keep(view, render.device) if clean is None else None
     if clean is not None:
         notes.add("views with a clean truth are scored against it instead of the photo")
+    near = landmark_pixels(observed[view.name], *render.shape[:2]) if view.name in observed else None
+    near = None if near is None else near.to(render.device)
     if protocol == "half":
         half = render.shape[1] // 2
         render, truth = render[:, half:], truth[:, half:]
         keep = None if keep is None else keep[:, half:]
+        near = None if near is None else near[:, half:]
     if keep is not None:
         notes.add(
             "pixels that a mask ignores are excluded from PSNR and SSIM, and replaced by the photo for LPIPS"
         )
         if not keep.any():
             notes.add(f"{view.name}: the mask ignores all pixels that would be scored")
-            return ImageScore(view.name, None, None, None)
+            return ImageScore(view.name)
+    energy, correlation = detail(render, truth, keep)
+    landmark, elsewhere = (None, None) if near is None else _apart(render, truth, near, keep)
     return ImageScore(
         name=view.name,
         psnr=psnr(render, truth, keep),
         ssim=structural_similarity(render, truth, keep),
         lpips=_perceptual(view, render, truth, keep, lpips, notes),
+        landmark=landmark,
+        elsewhere=elsewhere,
+        detail_energy=energy,
+        detail_correlation=correlation,
     )
+
+
+def _apart(
+    render: UInt8[Tensor, "H W 3"],
+    truth: UInt8[Tensor, "H W 3"],
+    near: Bool[Tensor, "H W"],
+    keep: Bool[Tensor, "H W"] | None,
+) -> tuple[float | None, float | None]:
+    """PSNR of the landmark, and of what is elsewhere; None where it has too few pixels."""
+    parts = [part if keep is None else part & keep for part in (near, ~near)]
+    if int(parts[0].sum()) < LEAST_LANDMARK_PIXELS:
+        return None, None
+    landmark, elsewhere = (psnr(render, truth, part) if part.any() else None for part in parts)
+    return landmark, elsewhere
 
 
 def _read_keep(view: View, device: torch.device) -> Bool[Tensor, "H W"] | None:

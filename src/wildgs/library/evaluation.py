@@ -44,6 +44,8 @@ def evaluate(
     if not isinstance(scene, Scene):
         scene = read_run_scene(loaded, scene, progress)
     scores: Scores = {}
+    scored = "full" in protocols and scene.test_views
+    photos = LoadedScene(loaded).photo_fits(scene=scene, progress=progress) if scored else []
     for protocol in protocols:
         count = _ViewCounter(progress, f"scoring {loaded.config.method}, protocol {protocol}", scene)
         scores[protocol] = score_views(
@@ -55,6 +57,7 @@ def evaluate(
             train_seconds=loaded.train_seconds,
             lpips_folder=None if lpips is None else Path(lpips),
             mask_threshold=loaded.method.mask_threshold,
+            photos=photos,
             on_view=count,
         )
     return scores

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.metrics import to_8bit
+from wildgs.evaluation.photos import PhotoFit, find_misfits, inspect_photos, read_photos, write_photos
 from wildgs.geometry.camera import Camera
 from wildgs.library.config import MixOptions
 from wildgs.light.look import Look, Timeline, mix
 from wildgs.light.saved import save_look
 from wildgs.light.sources import LightSources
 from wildgs.model.gaussians import Gaussians
-from wildgs.progress import Progress
+from wildgs.progress import Progress, counter
 from wildgs.rasterize import blend
 from wildgs.runs import Run, load_run
 from wildgs.scene import Scene, View
@@ -136,6 +137,26 @@ class LoadedScene:
             UserError: There is no such path or photo, or the file cannot be read.
         """
         return make_path(self.scene, kind, frames=frames, size=size, views=views)
+
+    def photo_fits(self, *, scene: Scene | None = None, progress: Progress | None = None) -> list[PhotoFit]:
+        """How well each training photo fits, and how much of it its mask hides.
+
+        Training keeps this in RUN/photos.json at its end; photos of a run without the file are inspected now.
+
+        Args:
+            scene: With the photos; None takes what the run folder carries.
+            progress: Called for every photo inspected.
+        """
+        photos = read_photos(self.run.folder, self.run.step)
+        if photos is None:
+            show = counter(progress, "inspecting training photos")
+            photos = inspect_photos(self.run.method, scene or self.scene, show)
+            write_photos(self.run.folder, self.run.step, photos)
+        return photos
+
+    def misfits(self) -> list[PhotoFit]:
+        """Training photos that fit no light, worst first: prints, drawings, other places, wrong poses."""
+        return find_misfits(self.photo_fits())
 
     @torch.no_grad()
     def depth(self, camera: Camera) -> Float[Tensor, "H W"]:

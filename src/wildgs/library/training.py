@@ -21,6 +21,7 @@ from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.evaluation.photos import PhotoFit, describe_misfits, inspect_photos, write_photos
 from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, run_log
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import (
@@ -51,7 +52,17 @@ Attachment = Callable[[Trainer, Scene], AbstractContextManager[Observer]]
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """A finished training; `seconds` excludes reading photos and saving, `device` is the GPU's name or the CPU."""
+    """A finished training.
+
+    Attributes:
+        folder: The run folder.
+        config: Its configuration.
+        steps: Steps done.
+        seconds: Training time, without reading photos and saving.
+        num_gaussians: N at the end.
+        device: Name of the GPU, or the CPU.
+        photos: How well each training photo fits; `find_misfits` picks those that fit no light.
+    """
 
     folder: Path
     config: RunConfig
@@ -59,6 +70,7 @@ class TrainedRun:
     seconds: float
     num_gaussians: int
     device: str
+    photos: Sequence[PhotoFit] = ()
 
 
 @dataclass(frozen=True)
@@ -278,12 +290,21 @@ def _train_to_end(
             interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume continues",)
             raise
         _save_last(saver, writer, trainer.step)
-        result = _result(job, config, trainer)
+        result = replace(_result(job, config, trainer), photos=_inspect(job, trainer))
         logger.info(
             f"{label}: {result.steps} steps in {result.seconds / 60:.1f} min on {result.device}, "
             f"{result.num_gaussians:,} Gaussians -> {folder}"
         )
+        for line in describe_misfits(result.photos):
+            logger.info("%s", line)
     return result
+
+
+def _inspect(job: _Job, trainer: Trainer) -> list[PhotoFit]:
+    """Looks for photos that fit no light, and keeps what it finds in the run folder."""
+    photos = inspect_photos(trainer.method, job.scene, counter(job.progress, "inspecting training photos"))
+    write_photos(job.folder, trainer.step, photos)
+    return photos
 
 
 def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:

@@ -201,12 +201,15 @@ def observations_of(
     return moved[moved[:, 0] >= 0]
 
 
-def observed_pixels(scene: Scene, least_photos: int = LEAST_PHOTOS) -> dict[str, Float[Tensor, "K 2"]]:
-    """Where each training photo shows points that photos agree on, in pixels (x, y) by the photo's name.
+def observed_pixels(
+    scene: Scene, least_photos: int = LEAST_PHOTOS, split: Split = "train"
+) -> dict[str, Float[Tensor, "K 2"]]:
+    """Where photos show points that photos agree on, in pixels (x, y) by the photo's name.
 
     Args:
         scene: With observations.
         least_photos: Points that fewer photos triangulated are left out.
+        split: Which photos.
     """
     pairs = scene.observations.long().unique(dim=0)
     photos = pairs[:, 1].bincount(minlength=len(scene.points))
@@ -214,7 +217,7 @@ def observed_pixels(scene: Scene, least_photos: int = LEAST_PHOTOS) -> dict[str,
     parts = pairs[:, 1].split(pairs[:, 0].bincount(minlength=len(scene.views)).tolist())
     pixels = {}
     for view, rows in zip(scene.views, parts, strict=True):
-        if view.split == "train" and len(rows):
+        if view.split == split and len(rows):
             found, depth = view.camera.project(scene.points[rows])
             size = torch.tensor([view.camera.width, view.camera.height])
             pixels[view.name] = found[(depth > 0) & ((found >= 0) & (found < size)).all(dim=1)]
