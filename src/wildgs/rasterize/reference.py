@@ -34,11 +34,7 @@ def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int,
     ty = (y / z).clamp(float(-cy / fy - margin_y), float((height - cy) / fy + margin_y))
     zero = torch.zeros_like(z)
     return torch.stack(
-        [
-            torch.stack([fx / z, zero, -fx * tx / z], -1),
-            torch.stack([zero, fy / z, -fy * ty / z], -1),
-        ],
-        dim=-2,
+        [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], dim=-2
     )
 
 
@@ -95,10 +91,7 @@ def project(
 
 
 def blend(
-    projection: Projection,
-    colors: Float[Tensor, "N C"],
-    background: Float[Tensor, "C"] | None,
-    depth: bool,
+    projection: Projection, colors: Float[Tensor, "N C"], background: Float[Tensor, "C"] | None, depth: bool
 ) -> Rendering:
     """See `wildgs.rasterize.blend`."""
     camera = projection.camera
