@@ -1,4 +1,4 @@
-"""A run's whole configuration: the rooms' own dataclasses in one, readable and writable as YAML."""
+"""The configuration of a run: one dataclass of those of all packages, read and written as YAML."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ MAX_CONFIG_BYTES = 1_000_000
 
 
 _BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
-"""First and last line: a file that is cut off would be YAML still, and missing entries take their defaults."""
+"""First and last line: a truncated file could still be valid YAML, with defaults for what is missing."""
 _MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
 """Entries of earlier versions' `config.yaml` that belong to `ExecutionConfig` now."""
 
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """How work is executed: without influence on the outcome, so that a resumed run takes it as given.
+    """How work is executed: without influence on the outcome, so that it may change when a run is resumed.
 
     Attributes:
         image_cache: Memory for decoded photos; photos beyond it are decoded again when their turn comes.
@@ -55,7 +55,7 @@ class ExecutionConfig:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuses values that mean nothing."""
+        """Checks the values."""
         parse_bytes(self.image_cache)
         parse_bytes(self.feature_cache)
         for name in ("checkpoint_every", "checkpoint_minutes", "log_every", "pictures_every", "threads"):
@@ -69,7 +69,7 @@ class RunConfig:
     """What decides a run's outcome.
 
     Attributes:
-        scene: The scene folder when the run was made; a place only, in which two equal configurations may differ.
+        scene: The scene folder at the time of training; not compared between configurations.
         method: A name in `wildgs.model.registry.METHODS`.
         data: How the scene is read.
         model: The method's own options, an instance of its `Config`; None takes the defaults.
@@ -83,7 +83,7 @@ class RunConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def __post_init__(self) -> None:
-        """Fills in the method's default options, and refuses those of another method."""
+        """Fills in the method's default options; those of another method are an error."""
         kind = config_type(self.method)
         if self.model is None:
             object.__setattr__(self, "model", kind())
@@ -106,13 +106,8 @@ def to_plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _shortened(value: Any) -> str:
-    """A value for a message; YAML's references can stand for more text than memory holds."""
-    return reprlib.repr(value)
-
-
 def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
-    """The inverse of `to_plain`; missing entries take their defaults.
+    """The inverse of `to_plain`; missing entries take their defaults. Values in messages are shortened (`reprlib`).
 
     Args:
         kind: The type to make.
@@ -139,12 +134,12 @@ def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
         return float(value)
     if isinstance(kind, type) and type(value) is kind and value == value:  # NaN is nothing
         return value
-    raise UserError(f"{where}: {_shortened(value)} is not a {getattr(kind, '__name__', kind)}")
+    raise UserError(f"{where}: {reprlib.repr(value)} is not a {getattr(kind, '__name__', kind)}")
 
 
 def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise UserError(f"{where}: expected a mapping, found {_shortened(value)}")
+        raise UserError(f"{where}: expected a mapping, found {reprlib.repr(value)}")
     hints = typing.get_type_hints(kind)
     if kind is RunConfig:
         try:
@@ -166,13 +161,8 @@ def _method_of(plain: dict[Any, Any]) -> str:
     return str(plain.get("method", DEFAULT_METHOD))
 
 
-_MOVED_RATES = {
-    "intrinsic": "intrinsic",
-    "networks": "networks",
-    "encoder": "encoder",
-    "network_decay": "decay",
-    "sh0": "sh0",
-    "shN": "shN",
+_MOVED_RATES = {name: name for name in ("intrinsic", "networks", "encoder", "sh0", "shN")} | {
+    "network_decay": "decay"
 }
 """From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
 
@@ -221,11 +211,11 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return from_plain(kind, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {_shortened(value)} fits none of {kinds}")
+    raise UserError(f"{where}: {reprlib.repr(value)} fits none of {kinds}")
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain data without references, by which a small file can stand for more than memory holds."""
+    """Plain data without aliases, by which a small file can expand to more than memory holds."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):

@@ -37,11 +37,7 @@ def save_look(look: Look, file: Path) -> Path:
     if file.suffix != SUFFIX:
         raise UserError(f"{file}: appearance files end in {SUFFIX}")
     tensors = _packed(look.embeddings)
-    header = {
-        "format": FORMAT,
-        "name": look.name,
-        "run": look.method.fingerprint(),
-    }
+    header = {"format": FORMAT, "name": look.name, "run": look.method.fingerprint()}
     with written_aside(file) as aside:
         aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
     return file
@@ -92,12 +88,7 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
 
 
 def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
-    """A file's embeddings for a method's Gaussians.
-
-    Raises:
-        KeyError: One is missing.
-        ValueError: They do not fit the method, or are not finite.
-    """
+    """A file's embeddings for a method's Gaussians; raises `KeyError` or `ValueError` if they do not fit."""
     device = method.gaussians.means.device
     common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
     if common.shape != (method.global_size,):

@@ -141,34 +141,50 @@ def _complete(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
+def holding(lock_file: Path) -> Iterator[bool | None]:
+    """Tries to lock a file while the block runs; the lock ends with the process.
+
+    Yields:
+        Whether this process holds the lock; None on a disk without locks, as some network disks are.
+
+    Raises:
+        UserError: The folder cannot be written to.
+    """
+    lock = filelock.FileLock(lock_file, timeout=0)
+    held: bool | None = True
+    try:
+        lock_file.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except filelock.Timeout:
+        held = False
+    except NotImplementedError:
+        held = None
+    except OSError as error:
+        raise UserError(
+            f"{lock_file.parent} cannot be written to ({error}); choose another --output"
+        ) from error
+    try:
+        yield held
+    finally:
+        lock.release()
+
+
+@contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Keeps other trainings out of a run folder while the block runs; the lock ends with the process.
+    """Keeps other trainings out of a run folder while the block runs.
 
     Raises:
         UserError: Another process uses the folder, or it cannot be written to.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder / LOCK_FILE, timeout=0)
-        lock.acquire()
-    except filelock.Timeout as error:
-        raise UserError(
-            f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
-        ) from error
-    except NotImplementedError:  # so filelock calls a disk that has no locks, as some network disks
-        warnings.warn(
-            f"{folder} lies on a disk without locks: nothing keeps a second training out of it",
-            WildGSWarning,
-            stacklevel=3,
-        )
+    with holding(folder / LOCK_FILE) as held:
+        if held is None:
+            message = f"{folder} is on a disk without locks: nothing keeps a second training out of it"
+            warnings.warn(message, WildGSWarning, stacklevel=3)
+        elif not held:
+            raise UserError(
+                f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
+            )
         yield
-        return
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:

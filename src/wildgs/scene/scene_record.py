@@ -1,4 +1,4 @@
-"""A scene without its photos, as numbers: written with a run, and compared with the scene that is found later."""
+"""A scene without its photos: written with a run, and compared with the scene that it is used with later."""
 
 from __future__ import annotations
 
@@ -113,11 +113,7 @@ class SceneRecord:
         return record
 
     def _check(self) -> None:
-        """Refuses rows that do not fit together.
-
-        Raises:
-            ValueError: They do not.
-        """
+        """Raises `ValueError` if tensors do not fit each other."""
         views, points = len(self.names), len(self.points)
         shapes: Mapping[str, Sequence[int]] = {
             "viewmats": (views, 4, 4),

@@ -51,7 +51,7 @@ class Workplace:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """COLMAP logs every step to stderr; failures reach us as exceptions and empty results."""
+    """Silences COLMAP's log on stderr; errors are exceptions and empty results."""
     previous = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
