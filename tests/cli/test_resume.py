@@ -31,11 +31,12 @@ def test_options_that_would_change_the_run_are_refused_by_name(
 ) -> None:
     before = (run / "config.yaml").read_bytes()
     capsys.readouterr()
-    options = ("--steps", 5000, "--downscale", 1, "--optimizer.means", 1e-3)
+    options = ("--steps", 5000, "--downscale", 1, "--max-side", 20, "--optimizer.means", 1e-3)
     assert wildgs("train", landmark, "--output", run, "--resume", *options) == 2
     line = complaint(capsys)
     assert "--steps 5000 (the run has 6)" in line
     assert "--downscale 1" in line
+    assert "--max-side 20 (the run has None)" in line
     assert "--optimizer.means 0.001" in line
     assert (run / "config.yaml").read_bytes() == before
 

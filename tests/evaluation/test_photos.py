@@ -90,8 +90,14 @@ def test_measures_without_truth_are_those_of_the_tools(half_hidden, shared, tmp_
     )
 
 
-def fit(name: str, psnr: float | None = 20.0, hidden: float = 0.05, static: float | None = 0.0) -> PhotoFit:
-    return PhotoFit(name, psnr, hidden, static, 0 if static is None else 100)
+def fit(
+    name: str,
+    psnr: float | None = 20.0,
+    hidden: float = 0.05,
+    static: float | None = 0.0,
+    structure: float = 0.7,
+) -> PhotoFit:
+    return PhotoFit(name, psnr, structure, hidden, static, 0 if static is None else 100)
 
 
 USUAL = [fit(f"{number}.jpg", 20 + 0.3 * (number % 7)) for number in range(20)]
@@ -107,14 +113,15 @@ def test_bad_fits_and_photos_that_are_hidden_are_named_worst_first():
         fit("print.jpg", 12.0),
         fit("far.jpg", 5.0, 0.3),
         fit("frame.jpg", 22.0, 0.7),
-        fit("all.jpg", None, 1.0),
+        fit("all.jpg", None, 1.0, structure=0.0),
+        fit("mirrored.jpg", structure=0.2),
     ]
     named = [photo.name for photo in find_misfits([*USUAL, *odd])]
     assert set(named) == {photo.name for photo in odd}
     assert named.index("far.jpg") < named.index("print.jpg")
     lines = describe_misfits([*USUAL, *odd])
-    assert "4 of 24" in lines[0]
-    assert any("frame.jpg: 22.0 dB, 70% hidden" in line for line in lines)
+    assert "5 of 25" in lines[0]
+    assert any("frame.jpg: 22.0 dB, structure 0.70, 70% hidden" in line for line in lines)
 
 
 def test_half_of_a_collection_cannot_make_the_other_half_look_odd():
@@ -125,12 +132,21 @@ def test_half_of_a_collection_cannot_make_the_other_half_look_odd():
     assert find_misfits([*bright, *dark]) == []
 
 
+def test_before_anything_is_learnt_structure_names_nobody():
+    photos = [fit(f"{number}.jpg", structure=0.02 * (number % 5)) for number in range(20)]
+    assert find_misfits(photos) == []
+
+
 def test_few_photos_have_no_usual_fit():
     assert find_misfits([*USUAL[:5], fit("odd.jpg", 3.0)]) == []
 
 
 def test_shares_are_weighted_by_observations_and_empty_without_tracks():
-    photos = [PhotoFit("a", 20.0, 0.1, 0.5, 10), PhotoFit("b", 20.0, 0.1, 0.0, 90), fit("c", static=None)]
+    photos = [
+        PhotoFit("a", 20.0, 0.5, 0.1, 0.5, 10),
+        PhotoFit("b", 20.0, 0.5, 0.1, 0.0, 90),
+        fit("c", static=None),
+    ]
     found = summarize_photos(photos)
     assert found["static_hidden"] == pytest.approx(0.05)
     assert found["static_hidden_worst"] == 0.5

@@ -10,8 +10,10 @@ import pytest
 from PIL import Image
 
 import wildgs
+from wildgs.config import write_config
 from wildgs.errors import UserError
 from wildgs.library.collection import compare_collection, record_collection
+from wildgs.library.pipeline import CPU_LONG_SIDE, GPU_LONG_SIDE, _photo_size
 from wildgs.runs import lock_run
 
 
@@ -74,6 +76,17 @@ def test_a_second_run_on_one_output_is_refused_at_once(photos: Path, tmp_path: P
     with lock_run(tmp_path / "run"), pytest.raises(UserError, match="in use"):
         wildgs.run(photos, tmp_path / "run")
     assert not (tmp_path / "run" / "scene").exists()
+
+
+def test_every_photo_has_a_limit_of_its_own_unless_the_run_began_otherwise(tmp_path: Path) -> None:
+    assert _photo_size(tmp_path, None, None).downscale == 1
+    assert _photo_size(tmp_path, None, None).max_side in (CPU_LONG_SIDE, GPU_LONG_SIDE)
+    assert _photo_size(tmp_path, None, 2.0) == wildgs.DataConfig(downscale=2.0)
+    assert _photo_size(tmp_path, 300, 2.0) == wildgs.DataConfig(downscale=2.0, max_side=300)
+    # As earlier versions began it: one divisor for all.
+    write_config(tmp_path / "config.yaml", wildgs.RunConfig(data=wildgs.DataConfig(downscale=2.7)))
+    assert _photo_size(tmp_path, None, None) == wildgs.DataConfig(downscale=2.7)
+    assert _photo_size(tmp_path, 300, None).max_side == 300
 
 
 def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: Path) -> None:

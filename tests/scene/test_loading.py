@@ -1,3 +1,4 @@
+import itertools
 import logging
 import os
 import shutil
@@ -12,6 +13,7 @@ from PIL import Image
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
+from wildgs.scene.undistort import PixelGrid
 
 MakeScene = Callable[..., Path]
 W, H = 48, 32
@@ -73,6 +75,48 @@ def test_downscale_divides_size_and_intrinsics(make_scene: MakeScene) -> None:
     assert third.views[1].read_photo().shape == (11, 16, 3)
     assert third.views[1].camera.K[1, 1].item() == pytest.approx(41 * 11 / 32)
     assert torch.equal(half.views[1].camera.viewmat, full.views[1].camera.viewmat)
+
+
+def test_a_limit_per_photo_reduces_large_photos_alone(tmp_path: Path) -> None:
+    """Sizes as a web collection has them: one divisor for all would leave 30 pixels of the small ones."""
+    sizes = [(4000, 2000), (900, 1200), (300, 200), (640, 480)]
+    for (width, height), most in itertools.product(sizes, (1, 37, 400, 641)):
+        params = [0.9 * width, 0.9 * width, 0.45 * width, 0.55 * height]
+        camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+        grid = PixelGrid.from_colmap(camera, max_side=most)
+        assert max(grid.width, grid.height) == min(most, max(width, height))
+        assert (
+            abs(grid.width / grid.height - width / height) * min(grid.width, grid.height) < 1 + width / height
+        )
+        scale = grid.width / width, grid.height / height
+        expected = [0.9 * width * scale[0], 0.9 * width * scale[1], 0.45 * grid.width, 0.55 * grid.height]
+        np.testing.assert_allclose([grid.K[0, 0], grid.K[1, 1], grid.K[0, 2], grid.K[1, 2]], expected)
+    divided = PixelGrid.from_colmap(camera, downscale=4, max_side=400)
+    assert (divided.width, divided.height) == (160, 120)
+    assert PixelGrid.from_colmap(camera, downscale=1.1, max_side=400).width == 400
+
+
+@pytest.mark.parametrize("distortion", [-0.3, -0.1, 0.1, 0.3])
+@pytest.mark.parametrize("most", [50, 333])
+def test_the_limit_holds_for_undistorted_views(distortion: float, most: int) -> None:
+    params = [700.0, 500.0, 300.0, distortion]
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=600, params=params)
+    grid = PixelGrid.from_colmap(camera, max_side=most)
+    assert max(0.7 * most, 1) < max(grid.width, grid.height) <= most
+
+
+def test_scenes_with_photos_of_two_sizes(make_scene: MakeScene) -> None:
+    root = make_scene(3)
+    model = pycolmap.Reconstruction(root / "sparse/0")
+    model.cameras[2].rescale(4 * W, 4 * H)
+    model.write_binary(root / "sparse/0")
+    path = root / "images/p01.png"
+    Image.open(path).resize((4 * W, 4 * H)).save(path)
+    views = load_scene(root, DataConfig(max_side=2 * W)).views
+    assert [view.read_photo().shape[:2] for view in views] == [(H, W), (2 * H, 2 * W), (H, W)]
+    full = load_scene(root).views
+    torch.testing.assert_close(views[1].camera.K[:2], full[1].camera.K[:2] / 2)
+    assert torch.equal(views[0].camera.K, full[0].camera.K)
 
 
 def test_photos_smaller_than_their_camera_carry_its_intrinsics(make_scene: MakeScene) -> None:
@@ -245,7 +289,7 @@ def test_holdout(make_scene: MakeScene, holdout: int, tests: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"downscale": 0.5}, {"downscale": float("nan")}, {"holdout": 1}, {"holdout": -1}]
+    "bad", [{"downscale": 0.5}, {"max_side": 0}, {"downscale": float("nan")}, {"holdout": 1}, {"holdout": -1}]
 )
 def test_senseless_settings_are_refused(bad: dict) -> None:
     with pytest.raises(UserError):

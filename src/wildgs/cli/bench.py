@@ -27,7 +27,17 @@ RANK_0_REPORTS = 10.0
 """Seconds that other ranks wait before they end with a mistake that rank 0 reports."""
 WIDTH_IN_FILES = 240
 """Characters that the printed table may take where no terminal has to show it."""
-SHOWN = ("output", "suite", "methods", "variant", "seeds", "lpips", "data.downscale", "train.steps")
+SHOWN = (
+    "output",
+    "suite",
+    "methods",
+    "variant",
+    "seeds",
+    "lpips",
+    "data.downscale",
+    "data.max_side",
+    "train.steps",
+)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from wildgs.config import ExecutionConfig
 from wildgs.scene.config import IMAGE_CACHE
 from wildgs.sfm.config import SfmConfig
 
-SHOWN = ("steps", "downscale", "max_gaussians", "holdout", "image_cache")
+SHOWN = ("steps", "max_side", "downscale", "max_gaussians", "holdout", "image_cache")
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,10 @@ class Command:
     """Run folder; the posed scene goes to OUTPUT/scene."""
     steps: int | None = None
     """Training steps."""
+    max_side: int | None = None
+    """Reduces each photo so that its own longer side is at most this many pixels; smaller ones stay as they are."""
     downscale: float | None = None
-    """Divides the photos' width and height."""
+    """Divides the photos' width and height, before --max-side; without --max-side the only reduction."""
     max_gaussians: int | None = None
     """Upper bound on the number of Gaussians; by default it follows the machine."""
     holdout: int = 8
@@ -53,6 +55,7 @@ def run(command: Command) -> None:
             command.photos,
             command.output,
             steps=command.steps,
+            max_side=command.max_side,
             downscale=command.downscale,
             max_gaussians=command.max_gaussians,
             holdout=command.holdout,

@@ -32,6 +32,7 @@ SHOWN = (
     "resume",
     "max_gaussians",
     "data.downscale",
+    "data.max_side",
     "train.steps",
     "train.seed",
     "model.without",

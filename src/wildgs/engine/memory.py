@@ -55,15 +55,15 @@ def plan_budget(
     if fits < least:
         raise UserError(
             f"{needs}, and {gigabytes(available)} are free, too little for the {least:,} Gaussians of the start: "
-            f"raise --downscale, lower --image-cache, or lower --max-gaussians to {max(fits, 0):,}"
+            f"raise --downscale, set --max-side, lower --image-cache, or lower --max-gaussians to {max(fits, 0):,}"
             if fits > 0
             else f"photos of {pixels / 1e6:.1f} megapixels do not fit into the {gigabytes(available)} that are "
-            "free: raise --downscale or lower --image-cache"
+            "free: raise --downscale, set --max-side, or lower --image-cache"
         )
     if explicit:
         raise UserError(
             f"{needs}, and {gigabytes(available)} are free: lower --max-gaussians to {fits:,}, raise --downscale, "
-            "or leave --max-gaussians out"
+            "set --max-side, or leave --max-gaussians out"
         )
     return fits, f"{needs}, and {gigabytes(available)} are free: the budget is {fits:,} Gaussians"
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn import functional
 
@@ -37,6 +38,14 @@ LEAST_DEVIATION = {"psnr": 1.0, "hidden": 0.05}
 """Smaller deviations count as this: dB, and share of the photo. In an even collection little would stand out."""
 MOSTLY = 0.5
 """A mask that hides less of a photo than this share is no reason to name the photo."""
+STRUCTURE_LOSS = 0.5
+"""A photo whose structure is lower than the median's by more than this share of it fits no light."""
+LEAST_STRUCTURE = 0.2
+"""A lower median: nothing is learnt yet that a photo could fit."""
+WINDOW = 0.025
+"""Standard deviation of the window of structure, as a share of the longer side."""
+LEAST_VARIANCE = 1e-4
+"""Windows of less luminance variance are flat, and their correlation is noise."""
 LEAST_PHOTOS = 8
 """Fewer photos have no usual fit from which one could differ."""
 
@@ -48,6 +57,8 @@ class PhotoFit:
     Attributes:
         name: Of the photo.
         psnr: Of the render under the photo's own appearance, over pixels that the mask does not hide, dB.
+        structure: Local correlation of the luminances of render and photo over the same pixels, weighted by the
+            photo's local contrast: 1 where edges agree, whatever the light; 0 where they have nothing in common.
         hidden: Share of pixels with M < `HIDDEN`.
         static_hidden: Share of static observations with M < `HIDDEN`: projections of points that three photos or
             more triangulated, which are no passers-by.
@@ -56,6 +67,7 @@ class PhotoFit:
 
     name: str
     psnr: float | None
+    structure: float
     hidden: float | None
     static_hidden: float | None
     observations: int
@@ -121,46 +133,69 @@ def _inspect(method: Method, view: View, observed: Float[Tensor, "K 2"] | None) 
     projection = method.gaussians.project(view.camera.resized(width, height).to(device))
     colors = blend(projection, method.paint(projection, appearance, method.sh_degree)).colors
     error = (colors.nan_to_num().clamp(0, 1).permute(2, 0, 1) - small[:3]).square().mean(dim=0)
-    weights, psnr = small[3], None
+    weights, psnr, structure = small[3], None, 0.0
     if float(weights.mean()) >= LEAST_SHOWN:
         mean = (error * weights).sum() / weights.sum()
         psnr = min(float(-10 * mean.log10()), MAX_PSNR)
-    return PhotoFit(view.name, psnr, hidden, static_hidden, count)
+        structure = _structure(small[:3].mean(dim=0), colors.nan_to_num().mean(dim=2), weights)
+    return PhotoFit(view.name, psnr, structure, hidden, static_hidden, count)
+
+
+def _structure(
+    photo: Float[Tensor, "h w"], render: Float[Tensor, "h w"], weights: Float[Tensor, "h w"]
+) -> float:
+    """Correlation of two luminances in Gaussian windows, averaged by the photo's contrast."""
+    first, second, shown = (values.double().cpu().numpy() for values in (photo, render, weights))
+    sigma = WINDOW * max(first.shape)
+    blurs = [gaussian_filter(x, sigma) for x in (first, second, first**2, second**2, first * second)]
+    variance, other = (np.maximum(blurs[i + 2] - blurs[i] ** 2, 0) for i in (0, 1))
+    covariance = blurs[4] - blurs[0] * blurs[1]
+    correlation = covariance / np.sqrt((variance + LEAST_VARIANCE) * (other + LEAST_VARIANCE))
+    contrast = np.sqrt(variance) * shown
+    return float((correlation * contrast).sum() / max(contrast.sum(), 1e-9))
 
 
 def find_misfits(photos: Sequence[PhotoFit]) -> list[PhotoFit]:
-    """Photos that fit no light, worst first: prints, drawings, collages, other places, wrong poses.
+    """Photos that fit no light, worst first: collages, drawings, other places, wrong poses.
 
-    A photo is named if its PSNR lies `DEVIATIONS` robust standard deviations below the collection's median, or if
-    its mask hides most of it and as many deviations more than usual. The deviation is that of a normal distribution
-    with the same median absolute deviation, or with the same quartile on the bad side where that is more: a quarter
-    of all photos, say those at night, is no misfit. Mean and standard deviation would follow what is looked for.
+    A photo is named for one of three reasons. Its structure is less than half of the median's: whatever the light,
+    edges lie elsewhere. Its PSNR lies `DEVIATIONS` robust standard deviations below the median. Or its mask hides
+    most of it, and as many deviations more than usual.
+
+    Mean and standard deviation would follow the very photos that are looked for. The deviation is that of a normal
+    distribution with the same median absolute deviation, or with the same quartile on the bad side where that is
+    more: a quarter of all photos, say those at night, is no misfit.
     """
-    rated = [photo for photo in photos if photo.psnr is not None]
+    severities = dict.fromkeys((photo.name for photo in photos), 0.0)
+
+    def judge(names: Sequence[str], values: Sequence[float]) -> None:
+        for name, value in zip(names, values, strict=True):
+            severities[name] = max(severities[name], value)
+
+    rated = [(photo.name, photo.psnr, photo.structure) for photo in photos if photo.psnr is not None]
     if len(rated) < LEAST_PHOTOS:
         return []
-    fit = _deviations([-photo.psnr for photo in rated if photo.psnr is not None], LEAST_DEVIATION["psnr"])
-    by_fit = dict(zip((photo.name for photo in rated), fit, strict=True))
-    masked = [photo for photo in photos if photo.hidden is not None]
-    hiding = _deviations([photo.hidden or 0.0 for photo in masked], LEAST_DEVIATION["hidden"])
-    by_mask = {
-        photo.name: deviation
-        for photo, deviation in zip(masked, hiding, strict=True)
-        if (photo.hidden or 0.0) > MOSTLY
-    }
-    worst = {photo.name: max(by_fit.get(photo.name, 0.0), by_mask.get(photo.name, 0.0)) for photo in photos}
-    named = [photo for photo in photos if worst[photo.name] > DEVIATIONS]
-    return sorted(named, key=lambda photo: worst[photo.name], reverse=True)
+    names, fits, structures = zip(*rated, strict=True)
+    judge(names, _deviations([-fit for fit in fits], LEAST_DEVIATION["psnr"]))
+    usual = statistics.median(structures)
+    if usual >= LEAST_STRUCTURE:
+        judge(names, [(usual - structure) / (STRUCTURE_LOSS * usual) for structure in structures])
+    masked = [(photo.name, photo.hidden) for photo in photos if photo.hidden is not None]
+    unusual = _deviations([hidden for _, hidden in masked], LEAST_DEVIATION["hidden"])
+    mostly = [(name, value) for (name, hidden), value in zip(masked, unusual, strict=True) if hidden > MOSTLY]
+    judge([name for name, _ in mostly], [value for _, value in mostly])
+    named = [photo for photo in photos if severities[photo.name] > 1]
+    return sorted(named, key=lambda photo: severities[photo.name], reverse=True)
 
 
 def _deviations(values: Sequence[float], least: float) -> list[float]:
-    """How many robust standard deviations each value lies above the median."""
+    """How far each value lies above the median; 1 is `DEVIATIONS` robust standard deviations."""
     if not values:
         return []
     middle, quartile = (float(q) for q in np.quantile(values, (0.5, 0.75)))
     spread = statistics.median(abs(value - middle) for value in values)
     deviation = max(1.4826 * spread, 1.4826 * (quartile - middle), least)
-    return [(value - middle) / deviation for value in values]
+    return [(value - middle) / (DEVIATIONS * deviation) for value in values]
 
 
 def describe_misfits(photos: Sequence[PhotoFit], most: int = 8) -> list[str]:
@@ -168,13 +203,18 @@ def describe_misfits(photos: Sequence[PhotoFit], most: int = 8) -> list[str]:
     named = find_misfits(photos)
     if not named:
         return []
-    usual = statistics.median(photo.psnr for photo in photos if photo.psnr is not None)
-    plural = "s fit" if len(named) > 1 else " fits"
+    rated = [photo for photo in photos if photo.psnr is not None]
+    usual = statistics.median(photo.psnr or 0.0 for photo in rated)
+    structure = statistics.median(photo.structure for photo in rated)
+    fit = "fit" if len(named) > 1 else "fits"
     lines = [
-        f"{len(named)} of {len(photos)} training photo{plural} no light (usual: {usual:.1f} dB); consider removing:"
+        f"{len(named)} of {len(photos)} training photos {fit} no light (usual: {usual:.1f} dB, structure "
+        f"{structure:.2f}), worst first; remove them if they show something else:"
     ]
     for photo in named[:most]:
-        fit = "nothing to compare" if photo.psnr is None else f"{photo.psnr:.1f} dB"
+        fit = "nothing to compare"
+        if photo.psnr is not None:
+            fit = f"{photo.psnr:.1f} dB, structure {photo.structure:.2f}"
         mask = "" if photo.hidden is None else f", {photo.hidden:.0%} hidden by its mask"
         lines.append(f"  {photo.name}: {fit}{mask}")
     return lines + ([f"  and {len(named) - most} more, see {PHOTOS_FILE}"] if len(named) > most else [])

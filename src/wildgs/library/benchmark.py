@@ -143,7 +143,7 @@ def _plan(
         raise UserError("a bench needs at least one scene, one of --methods or --variant, and one of --seeds")
     if request.suite == "phototourism":
         scenes = find_phototourism(scenes)
-        if base.data.downscale == 1:
+        if base.data.downscale == 1 and base.data.max_side is None:
             base = replace(base, data=replace(base.data, downscale=PHOTOTOURISM_DOWNSCALE))
     parsed = [parse_variant(text) for text in request.variants]
     reference = reference_preset(request.suite)

@@ -155,7 +155,7 @@ class LoadedScene:
         return photos
 
     def misfits(self) -> list[PhotoFit]:
-        """Training photos that fit no light, worst first: prints, drawings, other places, wrong poses."""
+        """Training photos that fit no light, worst first: collages, drawings, other places, wrong poses."""
         return find_misfits(self.photo_fits())
 
     @torch.no_grad()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.config import ExecutionConfig, RunConfig, read_config
 from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
@@ -23,7 +22,6 @@ from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
 from wildgs.scene.demo import write_demo_scene
-from wildgs.scene.images import UnreadableImageError, open_image
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.reconstruction import reconstruct
 
@@ -54,6 +52,7 @@ def run(
     output: str | Path,
     *,
     steps: int | None = None,
+    max_side: int | None = None,
     downscale: float | None = None,
     max_gaussians: int | None = None,
     holdout: int = 8,
@@ -68,7 +67,9 @@ def run(
         photos: Folder of photos.
         output: Run folder; the posed scene goes to OUTPUT/scene.
         steps: Training steps; by default 30,000 on a GPU and 3,000 on a CPU.
-        downscale: Divides the photos' width and height; by default to at most 1,600 pixels on a GPU, 400 on a CPU.
+        max_side: Reduces each photo so that its own longer side is at most so many pixels; by default 1,600 on a
+            GPU and 400 on a CPU, or no limit where `downscale` is given.
+        downscale: Divides the photos' width and height, before `max_side`.
         max_gaussians: Upper bound on the number of Gaussians; by default it follows the machine.
         holdout: Every n-th photo is held out for scoring; 0 for none.
         sfm: Options of structure from motion.
@@ -87,7 +88,8 @@ def run(
         _pose(photos, scene_folder, sfm, progress)
         if not (output / CONFIG_FILE).is_file():
             _estimate_depth_if_possible(scene_folder, progress)
-        config = _configure(scene_folder, steps, downscale, max_gaussians, holdout)
+        size = _photo_size(output, max_side, downscale)
+        config = _configure(scene_folder, steps, replace(size, holdout=holdout), max_gaussians)
         scene = read_scene(config, execution or ExecutionConfig(), progress)
         train(
             scene,
@@ -182,25 +184,22 @@ def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
         fill_depth_folder(scene, estimator, progress=counter(progress, "estimating depth"))
 
 
-def _configure(
-    scene: Path, steps: int | None, downscale: float | None, max_gaussians: int | None, holdout: int
-) -> RunConfig:
-    """Steps and size that suit the machine."""
+def _configure(scene: Path, steps: int | None, data: DataConfig, max_gaussians: int | None) -> RunConfig:
+    """Steps and number of Gaussians that suit the machine."""
     gpu = default_device().type == "cuda"
     steps = steps or (GPU_STEPS if gpu else CPU_STEPS)
-    downscale = downscale or _downscale_for(scene, GPU_LONG_SIDE if gpu else CPU_LONG_SIDE)
     most = max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
     train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=most))
-    return RunConfig(scene.resolve(), data=DataConfig(downscale=downscale, holdout=holdout), train=train)
+    return RunConfig(scene.resolve(), data=data, train=train)
 
 
-def _downscale_for(folder: Path, long_side: int) -> float:
-    """The factor that brings the largest photo to `long_side` pixels; 1 where it is smaller."""
-    sizes = [1]
-    for path in photo_files(folder / "images").values():
-        with contextlib.suppress(UnreadableImageError), open_image(path) as image:
-            sizes.append(max(image.size))
-    return max(1.0, round(max(sizes) / long_side, 2))
+def _photo_size(output: Path, max_side: int | None, downscale: float | None) -> DataConfig:
+    """The size of photos: as asked for, as OUTPUT was begun with, or as it suits the machine."""
+    if max_side is None and downscale is None:
+        if (output / CONFIG_FILE).is_file():
+            return read_config(output / CONFIG_FILE).data
+        max_side = GPU_LONG_SIDE if default_device().type == "cuda" else CPU_LONG_SIDE
+    return DataConfig(downscale=downscale or 1, max_side=max_side)
 
 
 COMPARED: tuple[MethodName, ...] = ("wildgs", "3dgs")

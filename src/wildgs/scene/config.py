@@ -27,6 +27,9 @@ class DataConfig:
 
     downscale: int | float = 1
     """Divides the photos' width and height (the paper: 2 on Phototourism)."""
+    max_side: int | None = None
+    """Reduces each photo, after --downscale, so that its own longer side is at most this many pixels; smaller ones
+    stay as they are."""
     holdout: int = 8
     """Every n-th photo tests where the scene has no .tsv split; 0 = all train."""
     use_masks: bool = True
@@ -40,6 +43,8 @@ class DataConfig:
         """Refuse values that mean nothing."""
         if not 1 <= self.downscale < float("inf"):
             raise UserError(f"downscale {self.downscale}: must be 1 (full size) or more")
+        if self.max_side is not None and self.max_side < 1:
+            raise UserError(f"max-side {self.max_side}: must be above 0")
         if self.holdout < 0 or self.holdout == 1:
             raise UserError(f"holdout {self.holdout}: must be 0 (all photos train) or at least 2")
         if self.max_image_pixels < 1:

@@ -157,7 +157,7 @@ def _pixel_grid(image: ColmapImage, config: DataConfig) -> PixelGrid:
         raise UnreadableImageError(
             f"its camera has {size[0]}x{size[1]} pixels, more than --max-image-pixels {config.max_image_pixels}"
         )
-    return PixelGrid.from_colmap(image.camera, config.downscale)
+    return PixelGrid.from_colmap(image.camera, config.downscale, config.max_side)
 
 
 def _report_broken(broken: Sequence[tuple[str, str]], views: Sequence[View], images_dir: Path) -> None:

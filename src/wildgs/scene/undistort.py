@@ -36,24 +36,31 @@ class PixelGrid:
     undistorted: Any = None
 
     @classmethod
-    def from_colmap(cls, camera: Any, downscale: int | float) -> PixelGrid:
-        """The grid of a view that is `downscale` times smaller than its camera.
+    def from_colmap(cls, camera: Any, downscale: int | float = 1, max_side: int | None = None) -> PixelGrid:
+        """The grid of a view that is smaller than its camera.
 
         Args:
             camera: pycolmap's camera, any model that sees less than a half-sphere.
             downscale: Divides width and height; the result is rounded to whole pixels.
+            max_side: Longer side of the view at most, after division; None for no limit.
 
         Returns:
             Pinhole cameras as they are; others with the pinhole camera that pycolmap finds for them (no blank
             pixels), at the smaller size.
         """
         size = (camera.width, camera.height)
+        downscale = max(downscale, max(size) / (max_side or max(size)))
         resized = (max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale)))
         scaled = pycolmap.Camera(camera.todict())
         scaled.rescale(*resized)
         if camera.is_undistorted():
             return cls(size, resized, _intrinsics(scaled), *resized)
         pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), scaled)
+        excess = max(pinhole.width, pinhole.height) / (max_side or np.inf)
+        if excess > 1:  # without distortion the view is larger than the photo
+            return cls.from_colmap(
+                camera, downscale * excess * (1 + 0.5 / max(pinhole.width, pinhole.height))
+            )
         return cls(size, resized, _intrinsics(pinhole), pinhole.width, pinhole.height, scaled, pinhole)
 
     def source(self) -> Float32[np.ndarray, "H W 2"] | None:

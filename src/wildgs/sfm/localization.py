@@ -190,7 +190,7 @@ def _as_view(
 ) -> LocalizedPhoto:
     """The photo as a view of the scene: pinhole camera, aligned frame, size of the scene's photos."""
     longest = max(camera.width, camera.height)
-    grid = PixelGrid.from_colmap(camera, max(1.0, longest / long_side))
+    grid = PixelGrid.from_colmap(camera, max_side=long_side)
     image = Image.fromarray(pixels).resize(grid.resized, Image.Resampling.LANCZOS)
     source = grid.source()
     photo = np.array(image) if source is None else sample_colors(np.asarray(image), source)
