@@ -107,15 +107,11 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
-    """The inverse of `to_plain`; missing entries take their defaults. Values in messages are shortened (`reprlib`).
-
-    Args:
-        kind: The type to make.
-        value: Plain data, for example from YAML.
-        where: Named in errors.
+    """The inverse of `to_plain`; missing entries take their defaults.
 
     Raises:
-        UserError: An entry is unknown or of the wrong type.
+        UserError: An entry of `where` is unknown or of the wrong type. Values in messages are shortened
+            (`reprlib`).
     """
     if dataclasses.is_dataclass(kind):
         return _dataclass_from_plain(kind, value, where)
@@ -258,15 +254,10 @@ def read_config(path: Path) -> RunConfig:
 
 
 def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "config") -> RunConfig:
-    """A configuration with some entries changed.
-
-    Args:
-        config: Left as it is.
-        entries: From an entry's path, as in ``model.learning_rates.networks``, to its plain value.
-        where: Named in errors.
+    """A configuration with some entries (paths such as ``model.learning_rates.networks``) set to plain values.
 
     Raises:
-        UserError: There is no such entry, or the value is of the wrong type.
+        UserError: There is no such entry, or the value is of the wrong type; `where` is named in the message.
     """
     if isinstance(method := entries.get("method"), str):
         try:

@@ -52,8 +52,8 @@ class Optimizers:
         """Optimisers for a method.
 
         Args:
-            method: Whose parameters are optimised.
-            config: Learning rates.
+            method: The method.
+            config: Learning rates of the geometry.
             extent: Radius of the cameras' region, world units (3DGS's spatial learning rate scale).
             photos: Photos in the mean gradient of one step.
         """
@@ -136,13 +136,10 @@ def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
 def edit_rows(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, keep: Bool[Tensor, "N"], added: dict[str, Tensor]
 ) -> None:
-    """Drops and appends Gaussians, in parameters and optimiser state alike.
+    """Drops and appends Gaussians in place, in parameters and optimiser state alike.
 
-    Args:
-        gaussians: Edited in place.
-        optimizer: Holds one group a row, named after it.
-        keep: Which present Gaussians stay, in their order.
-        added: New Gaussians' rows, one tensor for every row name; they start with empty Adam moments.
+    `keep` says which Gaussians stay, in their order; `added` has a tensor for every row name. New Gaussians start
+    with empty Adam moments.
     """
 
     def edited(name: str, values: Tensor, moments: bool) -> Tensor:

@@ -62,11 +62,7 @@ class Splats:
         return replace(self, sh=sh)
 
     def to_input_frame(self, alignment: Alignment) -> Splats:
-        """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale.
-
-        Args:
-            alignment: Transform from the frame of the input to that of the Gaussians.
-        """
+        """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale."""
         back = alignment.inverse()
         rotated = self.rotated(back.rotation)
         return replace(rotated, means=back.apply_points(self.means), scales=self.scales * back.scale)
@@ -91,13 +87,7 @@ BOX_QUANTILE = 0.02
 
 
 def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:
-    """Mask of the Gaussians that are kept.
-
-    Args:
-        config: What to drop.
-        splats: Gaussians in the aligned frame of the scene.
-        points: SfM points in the same frame.
-    """
+    """Mask of the Gaussians (aligned frame) that are kept; `points` are the SfM points in the same frame."""
     keep = splats.opacities >= config.min_opacity
     if config.max_distance is not None:
         middle = points.median(dim=0).values.to(splats.means)
@@ -115,13 +105,9 @@ def clean(
     points: Float[Tensor, "P 3"],
     viewpoints: Float[Tensor, "V 3"],
 ) -> Splats:
-    """Gaussians after dropping and truncating as configured.
+    """Gaussians after dropping and truncating as configured, all in the aligned frame of the scene.
 
-    Args:
-        config: What to drop.
-        splats: Gaussians in the aligned frame of the scene.
-        points: SfM points in the same frame.
-        viewpoints: Camera centres; truncated harmonics are fitted to the directions from them.
+    Truncated harmonics are fitted to the directions from the camera centres `viewpoints`.
     """
     kept = splats.select(kept_rows(config, splats, points)) if config.active else splats
     if config.sh_degree is None or num_sh_bases(config.sh_degree) >= kept.sh.shape[1]:

@@ -8,11 +8,7 @@ from torch import Tensor
 
 
 def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Rotation matrices of quaternions, which need not be normalised.
-
-    Args:
-        quats: Quaternions (w, x, y, z), as in gsplat and COLMAP.
-    """
+    """Rotation matrices of quaternions (w, x, y, z), as in gsplat and COLMAP; they need not be normalised."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

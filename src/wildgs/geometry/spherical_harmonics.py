@@ -116,13 +116,10 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
 def truncate_sh(
     sh: Float[Tensor, "N K 3"], degree: int, fit: Float[Tensor, "N L M"] | None = None
 ) -> Float[Tensor, "N L 3"]:
-    """Coefficients of a lower degree.
+    """Coefficients of a lower degree; those of this degree or a lower one are returned unchanged.
 
-    Args:
-        sh: Coefficients.
-        degree: Degree of the result. Coefficients of this degree or a lower one are returned unchanged.
-        fit: From `fit_truncation` for the same degrees: preserves the colours in the directions of the cameras.
-            None drops the higher degrees, which is best on average over all directions.
+    A `fit` of `fit_truncation` for the same degrees preserves the colours in the directions of the cameras.
+    Without it the higher degrees are dropped, which is best on average over all directions.
 
     Raises:
         ValueError: The degree is out of range, or the fit is for other degrees.

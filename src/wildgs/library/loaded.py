@@ -42,7 +42,6 @@ class LoadedScene:
     """
 
     def __init__(self, run: Run) -> None:
-        """Sets up a `LoadedScene`; `load` is the usual way."""
         self.run = run
         self._sources = LightSources(run.method, lambda: self.scene, run.folder / FEATURE_INDEX_FILE)
 

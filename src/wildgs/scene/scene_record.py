@@ -151,15 +151,9 @@ class SceneRecord:
         return Scene(root, views, self.points, self.point_colors, self.alignment, self.observations)
 
     def adopt(self, found: Scene) -> tuple[Scene, list[str]]:
-        """The recorded scene with the photos of one that was read from a folder.
+        """The recorded scene with the photos of the scene as it is now, and what differs between the two, in words.
 
         Poses, split, points and alignment are the record's; intrinsics are those of the photos found.
-
-        Args:
-            found: The scene as it is now.
-
-        Returns:
-            The scene, and what differs between the two, in words; empty where nothing does.
         """
         now = {view.name: view for view in found.views}
         recorded = self.scene(found.root, found.views[0].photos)

@@ -146,14 +146,9 @@ def _described_points(
 def find_features(
     pixels: UInt8[np.ndarray, "H W 3"], limit: int = MAX_IMAGE_SIZE
 ) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
-    """SIFT features of a photo.
+    """SIFT features of an RGB photo: positions in its pixels, and descriptors.
 
-    Args:
-        pixels: RGB.
-        limit: Features are sought at no more than this many pixels on the long side.
-
-    Returns:
-        Positions in the photo's pixels, and descriptors.
+    They are sought at no more than `limit` pixels on the long side.
     """
     height, width = pixels.shape[:2]
     grey = Image.fromarray(pixels).convert("L")

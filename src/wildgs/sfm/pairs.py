@@ -44,12 +44,7 @@ def exhaustive_pairs(count: int) -> Pairing:
 
 
 def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set[tuple[int, int]]:
-    """Photos with the most similar ones.
-
-    Args:
-        vlads: A unit vector for every photo.
-        partners: How many partners to find, by photo.
-    """
+    """Photos with the most similar ones, by their unit vectors; `partners` is how many to find by photo."""
     pairs = set()
     for photo, wanted in partners.items():
         likeness = vlads @ vlads[photo]

@@ -21,19 +21,10 @@ TOKEN_BYTES = 24
 
 
 class AccessControl:
-    """Decides which requests the viewer answers.
-
-    Attributes:
-        token: First segment of every path that is served.
-    """
+    """Decides which requests the viewer answers; `token` is the first segment of every path that is served."""
 
     def __init__(self, host: str, token: str | None = None) -> None:
-        """Sets up the access control.
-
-        Args:
-            host: Address that the server listens on.
-            token: None makes a random one.
-        """
+        """Takes the address that the server listens on; without a token, makes a random one."""
         self.token = token or secrets.token_urlsafe(TOKEN_BYTES)
         self._loopback_only = is_loopback(host)
         self._names = {"localhost", *(() if self._loopback_only else own_names(host))}
@@ -45,10 +36,8 @@ class AccessControl:
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
         """Why a request is refused, None if it is accepted.
 
-        Args:
-            path: Of the request, with the token as its first segment.
-            hosts: All values of the Host header.
-            origins: All values of the Origin header; browsers send one with every WebSocket handshake.
+        `path` has the token as its first segment; `hosts` and `origins` are all values of these headers. Browsers
+        send an Origin with every WebSocket handshake.
         """
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return "the Host header does not name this machine; use its IP address or its own name"

@@ -108,15 +108,9 @@ import_module("pycolmap")
 
 
 class OpenViewer:
-    """A run's page that is being served.
-
-    Attributes:
-        viewer: The page.
-        urls: Where it is reached.
-    """
+    """A page that is being served at `urls`; use `view` to open one."""
 
     def __init__(self, viewer: Viewer, urls: Sequence[str]) -> None:
-        """Use `view` to open one."""
         self.viewer, self.urls = viewer, tuple(urls)
         self._worker: threading.Thread | None = None
 
