@@ -22,8 +22,9 @@ from wildgs.model import registry
 from wildgs.model.appearance import Embeddings
 from wildgs.model.config import InitialConfig, ParsingConfig, SkyConfig, WrappingConfig
 from wildgs.model.gaussians import GEOMETRY_ROWS
-from wildgs.model.method import Method, Stage
+from wildgs.model.method import Method
 from wildgs.model.registry import METHODS, create_method, method_type, restore_method
+from wildgs.model.training_pass import Stage
 from wildgs.presets import with_preset
 from wildgs.scene import Scene
 

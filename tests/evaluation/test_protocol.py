@@ -15,7 +15,8 @@ from wildgs.evaluation.protocol import evaluate
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, geometry_from_points
-from wildgs.model.method import Method, Stage, TrainingOutput
+from wildgs.model.method import Method
+from wildgs.model.training_pass import Stage, TrainingOutput
 from wildgs.rasterize import Rendering
 from wildgs.scene.scene import Alignment, Scene, View
 

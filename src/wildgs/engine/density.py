@@ -119,6 +119,7 @@ class DensityControl:
         generator: torch.Generator,
         *,
         prune_large: bool,
+        growable: Bool[Tensor, "N"] | None = None,
     ) -> DensityReport:
         """One round: clones and splits where the screen gradient is large, prunes the faint.
 
@@ -127,10 +128,11 @@ class DensityControl:
             optimizer: Edited alike.
             generator: Draws the split positions.
             prune_large: Whether oversized Gaussians go as well.
+            growable: Which Gaussians may be cloned and split; None for all.
         """
         scales = gaussians.scales
         largest = scales.max(dim=-1).values
-        grows = self._select_growing()
+        grows = self._select_growing(growable)
         clones = grows & (largest <= self.config.split_scale * self.extent)
         splits = grows & ~clones
         prune = gaussians.opacities < self.config.prune_opacity
@@ -160,8 +162,10 @@ class DensityControl:
             large = large | (self.reach > self.config.prune_reach)
         return large
 
-    def _select_growing(self) -> Bool[Tensor, "N"]:
+    def _select_growing(self, growable: Bool[Tensor, "N"] | None) -> Bool[Tensor, "N"]:
         mean = self.gradient_sum / self.seen.clamp_min(1)
+        if growable is not None:
+            mean = mean * growable
         grows = mean > self.config.grow_gradient
         room = self.config.max_gaussians - len(mean)
         if int(grows.sum()) > room:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from wildgs.engine.config import ScheduleConfig
-from wildgs.model.method import Stage
+from wildgs.model.training_pass import Stage
 
 REFERENCE_STEPS = 30_000
 """The paper's training length; schedules below are stated for it and scale with the run's own length."""

@@ -21,7 +21,7 @@ from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
-from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.method import Method
 from wildgs.model.parsing import FeatureCache, keep_features
 from wildgs.model.precision import (
     choose_precision,
@@ -29,6 +29,7 @@ from wildgs.model.precision import (
     set_precision,
     switch_replays,
 )
+from wildgs.model.training_pass import SeenPhoto, TrainingOutput
 from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
 from wildgs.scene.scene import observed_pixels
@@ -134,6 +135,8 @@ class Trainer:
             self.begin()
             while self.step < self.config.steps:
                 report = self.advance()
+                if self.step >= self.config.steps:
+                    self._finish()
                 for observer in observers:
                     observer(report)
         finally:
@@ -227,7 +230,11 @@ class Trainer:
         if self.schedule.densifies(self.step, taken):
             large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
-                self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
+                self.method.gaussians,
+                self.optimizers.rows,
+                self.generator,
+                prune_large=large,
+                growable=self.method.growable(),
             )
             if report.cloned or report.split or report.pruned:
                 sort_rows(self.method.gaussians, self.optimizers.rows)
@@ -236,7 +243,12 @@ class Trainer:
     def shrink_to_budget(self) -> int:
         """Drops Gaussians beyond `density.max_gaussians`, where that was lowered since; returns how many."""
         budget = self.config.density.max_gaussians
-        return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+        excess = self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+        if excess:
+            self.method.finish((), 0)
+            if self.step >= self.config.steps:
+                self._finish()
+        return excess
 
     def _prepare(self) -> None:
         """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
@@ -244,6 +256,18 @@ class Trainer:
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
+
+    def _finish(self) -> None:
+        """Shows the method the training photos once more."""
+        start = time.perf_counter()
+        switch_replays(self.method, False)
+        readable = [view for view in self.views if self.feed.is_readable(view)]
+        self.method.finish(map(self._seen, readable), len(readable))
+        self.seconds += time.perf_counter() - start
+
+    def _seen(self, view: View) -> SeenPhoto:
+        photo, keep = self.feed.photo(view)
+        return SeenPhoto(photo, self.feed.camera(view), keep, view.name)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to continue exactly, as flat tensors."""
@@ -272,6 +296,8 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
+        if self.step < self.config.steps:
+            self.method.finish((), 0)
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

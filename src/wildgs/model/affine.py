@@ -28,7 +28,8 @@ from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
 from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.method import Method, ParameterGroup, Stage, TrainingOutput
+from wildgs.model.method import Method
+from wildgs.model.training_pass import ParameterGroup, Stage, TrainingOutput
 from wildgs.rasterize import blend
 
 FOURIER_ENTRIES = 6

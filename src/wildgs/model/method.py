@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -20,54 +19,8 @@ from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, me
 from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
 from wildgs.model.gaussians import Gaussians, rows_to_shade, take_rows
 from wildgs.model.initial import InitialGaussians, initial_from_points
+from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
-
-
-@dataclass(frozen=True)
-class Stage:
-    """The state of the training schedule that a method's forward pass depends on.
-
-    Attributes:
-        explicit: Whether local appearance (the triplane) is on: off in the paper's first stage.
-        learn_mask: Whether the visibility mask takes gradients now.
-        sh_degree: Active degree of the spherical harmonics.
-        learn_encoder: Whether the photo's encoder takes gradients now.
-    """
-
-    explicit: bool = True
-    learn_mask: bool = True
-    sh_degree: int = 3
-    learn_encoder: bool = True
-
-
-@dataclass(frozen=True)
-class TrainingOutput:
-    """One training view's forward pass.
-
-    Attributes:
-        rendering: Colours, expected depth and alpha.
-        projection: Its screen statistics feed densification.
-        visibility: M, or None for a method without a mask.
-    """
-
-    rendering: Rendering
-    projection: Projection
-    visibility: Float[Tensor, "H W"] | None
-
-
-@dataclass(frozen=True)
-class ParameterGroup:
-    """Network parameters that share a learning rate.
-
-    Attributes:
-        name: Unique among the groups of a method.
-        parameters: Not rows of the Gaussians: those have `Method.row_rates`.
-        rate: Their learning rate.
-    """
-
-    name: str
-    parameters: list[nn.Parameter]
-    rate: LearningRate
 
 
 class Method(nn.Module, ABC):
@@ -101,6 +54,11 @@ class Method(nn.Module, ABC):
     local_size: int = 0
     mask_threshold: float = 0.5
     depth_supervised: bool = False
+
+    @property
+    def basis_size(self) -> int:
+        """Number of basis weights of an appearance; 0 for a method that fits none."""
+        return 0
 
     # What a method declares.
 
@@ -147,10 +105,22 @@ class Method(nn.Module, ABC):
         """N."""
         return len(self.gaussians)
 
+    def growable(self) -> Bool[Tensor, " N"] | None:
+        """Which Gaussians densification may clone and split; None for all."""
+        return None
+
     # Encode, shade, render.
 
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
         """Looks at some training photos (RGB in [0, 1]) once, before the first step."""
+
+    def finish(self, photos: Iterable[SeenPhoto], count: int) -> None:
+        """Looks at the training photos once more, after the last step.
+
+        Args:
+            photos: Read one at a time; none where training continues: what was learnt from them is forgotten.
+            count: How many there are.
+        """
 
     def encode(
         self,
