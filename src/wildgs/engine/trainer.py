@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wildgs import features
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.density import DensityControl, DensityReport
 from wildgs.engine.feed import PhotoFeed, ViewSampler
@@ -54,7 +55,8 @@ class StepReport:
         visibility: The mask M, detached; None for a method without one.
         num_gaussians: N after the step.
         density: What densification did, where it ran.
-        skipped: Why the step was skipped, where its loss or gradient was non-finite.
+        skipped: Why the step was skipped, where its loss or gradient was not finite; on a GPU, why the step before
+            was.
         taken: Steps that this one counts for: photos of all processes.
         seconds: Training time so far, without the time that observers take.
     """
@@ -84,6 +86,7 @@ class Trainer:
     Attributes:
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         feature_cache: Bytes for the features that a frozen encoder gave of training photos.
+        skips_on_device: Whether steps that are not finite are skipped without waiting for the device.
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
@@ -121,6 +124,7 @@ class Trainer:
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
+        self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
         self.cuda_graphs = True
         self.feature_cache = FEATURE_CACHE_BYTES
@@ -136,6 +140,7 @@ class Trainer:
             while self.step < self.config.steps:
                 report = self.advance()
                 if self.step >= self.config.steps:
+                    self._report_marked()
                     self._finish()
                 for observer in observers:
                     observer(report)
@@ -172,17 +177,10 @@ class Trainer:
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
+        skipped = self._report_marked()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
-        fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
-        if fault is None:
-            if self.schedule.gathers(self.step):
-                self.density.gather(output.projection, self.team.pool)
-            self.optimizers.step()
-        else:
-            self.method.zero_grad(set_to_none=True)
-            with self.team.propagate_errors():
-                self.guard.report(self.step + 1, fault, self.method)
+        skipped = self._take(output, losses) or skipped
         before = self.step
         self.step = min(before + self.team.size, self.config.steps)
         taken = self.step - before
@@ -197,9 +195,38 @@ class Trainer:
             num_gaussians=len(self.method.gaussians),
             density=density,
             seconds=self.seconds,
-            skipped=fault,
+            skipped=skipped,
             taken=taken,
         )
+
+    def _take(self, output: TrainingOutput, losses: Losses) -> str | None:
+        """Lets the optimisers take the step unless it is not finite; why it was skipped, where that is known."""
+        gathers = self.schedule.gathers(self.step)
+        if self.skips_on_device:
+            faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
+            if gathers:
+                self.density.gather(output.projection, self.team.pool, faulty == 0)
+            self.optimizers.step(faulty)
+            return None
+        fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
+        if fault is None:
+            if gathers:
+                self.density.gather(output.projection, self.team.pool)
+            self.optimizers.step()
+        else:
+            self.method.zero_grad(set_to_none=True)
+            with self.team.propagate_errors():
+                self.guard.report(self.step + 1, fault, self.method)
+        return fault
+
+    def _report_marked(self) -> str | None:
+        """Reports the step before where it was skipped by the GPU, which has finished it by now; why it was."""
+        found = self.guard.judge_marked()
+        if found is None:
+            return None
+        with self.team.propagate_errors():
+            self.guard.report(*found, self.method)
+        return found[1]
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view)
@@ -235,9 +262,8 @@ class Trainer:
                 self.generator,
                 prune_large=large,
                 growable=self.method.growable(),
+                sort=True,
             )
-            if report.cloned or report.split or report.pruned:
-                sort_rows(self.method.gaussians, self.optimizers.rows)
         return report
 
     def shrink_to_budget(self) -> int:
