@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -119,7 +120,7 @@ class StepGuard:
         self._skipped += 1
         self.in_a_row += 1
         self._photos.append(photo)
-        wrong = [name for name, value in terms.items() if not _finite(value)]
+        wrong = [name for name, value in terms.items() if not math.isfinite(value)]
         return f"loss term {wrong[0]}" if wrong else "gradient"
 
     def report(self, step: int, fault: str, method: nn.Module) -> None:
