@@ -18,7 +18,7 @@
 set -uo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-scene= wheels= lpips= output=gpu-out budget=540 dry= stages=()
+scene= wheels= lpips= output=gpu-out budget= dry= stages=()
 while [ $# -gt 0 ]; do
   case $1 in
     --scene) scene=$2; shift 2 ;;
@@ -42,6 +42,7 @@ done
 
 python=${PYTHON:-python3}
 steps=${STEPS:-30000}
+[ -n "$budget" ] || budget=$([ -n "$dry" ] && echo 3000 || echo 540)
 reserve=170 # seconds of the budget for training, scores and packing
 parts=$output/parts
 export PYTHONPATH="$root/src:$root/benchmarks:$root${PYTHONPATH:+:$PYTHONPATH}" HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1}
@@ -51,7 +52,7 @@ tiny=() step_sizes=(--width 1000 --n 1000000 --steps 8) render_sizes=(--backends
 train_sizes=()
 if [ -n "$dry" ]; then
   export CUDA_VISIBLE_DEVICES=
-  tiny=(--tiny) step_sizes=(--width 48 --n 200 --steps 1) render_sizes=(--backends cpu --n 200 --sizes 32x24)
+  tiny=(--tiny) step_sizes=(--width 48 --n 200 --steps 1 --photos 8) render_sizes=(--backends cpu --n 200 --sizes 32x24)
   train_sizes=(--wrapping.resolution 8 --parsing.max-side 64 --max-gaussians 300 --log-every 1)
 elif [ -z "${TORCH_CUDA_ARCH_LIST:-}" ]; then
   # For this GPU alone: gsplat's kernels take minutes for each architecture.

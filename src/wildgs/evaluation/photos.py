@@ -249,5 +249,10 @@ def read_photos(folder: Path, step: int) -> list[PhotoFit] | None:
     try:
         content = json.loads((folder / PHOTOS_FILE).read_text(encoding="utf-8"))
         return [PhotoFit(**photo) for photo in content["photos"]] if content["step"] == step else None
-    except (OSError, ValueError, TypeError, KeyError):  # absent, of another version, or cut off: found anew
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+    ):  # absent, of another version, or cut off: computed again
         return None
