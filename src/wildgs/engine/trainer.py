@@ -312,10 +312,8 @@ class Trainer:
         """Continues from `state`; the method must have been restored from the same checkpoint already."""
         self.optimizers.restore(_under(state, "optimizer."))
         if not self.sampler.restore(_under(state, "sampler.")):
-            message = (
-                f"the run began with other photos; it continues with the {len(self.views)} that there are now"
-            )
-            warnings.warn(message, WildGSWarning, stacklevel=2)
+            message = f"the run began with other photos than the {len(self.views)} that train now"
+            warnings.warn(f"{message}; it continues with these", WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         self._process.set_random_states(_under(state, "random."))

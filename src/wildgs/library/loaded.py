@@ -20,7 +20,7 @@ from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.photos import PhotoFit, find_misfits, inspect_photos, read_photos, write_photos
 from wildgs.geometry.camera import Camera
 from wildgs.library.config import MixOptions
-from wildgs.light.look import Look, Timeline, mix
+from wildgs.light.look import Look, Timeline, mix, with_sky
 from wildgs.light.saved import save_look
 from wildgs.light.sources import LightSources
 from wildgs.model.gaussians import Gaussians
@@ -254,9 +254,14 @@ def find_looks(
     looks = [find(spec) for spec in specs]
     if mixing.weights:
         looks = [mix(looks, mixing.weights)]
-    if parts == (None, None):
+    if parts != (None, None):
+        if len(looks) > 1:
+            raise UserError(
+                "--global and --local change one appearance; give one, or --weights to mix several"
+            )
+        both = [looks[0] if spec is None else find(spec) for spec in parts]
+        looks = [mix(both, [1, 0], local_weights=[0, 1])]
+    if mixing.sky is None:
         return looks
-    if len(looks) > 1:
-        raise UserError("--global and --local change one appearance; give one, or --weights to mix several")
-    both = [looks[0] if spec is None else find(spec) for spec in parts]
-    return [mix(both, [1, 0], local_weights=[0, 1])]
+    sky = find(mixing.sky)
+    return [with_sky(look, sky) for look in looks]

@@ -89,7 +89,7 @@ def render(
     scene = loaded(run)
     cameras, fps = _find_cameras(scene, trajectory, views)
     looks = find_looks(scene, appearance, mixing, progress=progress)
-    like = MixOptions(like=mixing.like if mixing else None)
+    like = MixOptions(like=mixing.like, sky=mixing.sky) if mixing else None
     looks += find_looks(scene, to, like, progress=progress)
     if is_video(output):
         cameras = [_even(camera) for camera in cameras]

@@ -30,18 +30,24 @@ class Look:
         embeddings: What `mix` mixes.
         method: The trained method to which the embeddings belong.
         note: How the light was found, where that is worth a line to the user.
+        sky: The look from which the sky's colours are taken; None takes this one's.
     """
 
     name: str
     embeddings: Embeddings = field(repr=False)
     method: Method = field(repr=False)
     note: str = ""
+    sky: Look | None = field(default=None, repr=False)
 
     @cached_property
     def sh(self) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics of all Gaussians under this light, on the method's device; shaded once, then kept."""
         with torch.no_grad():
-            return self.method.fuse(self.embeddings)
+            own = self.method.fuse(self.embeddings)
+            which = None if self.sky is None else self.method.sky()
+            if self.sky is None or which is None:
+                return own
+            return torch.where(which[:, None, None], self.sky.sh, own)
 
 
 @torch.no_grad()
@@ -53,6 +59,19 @@ def look_of(method: Method, appearance: Appearance, name: str, note: str = "") -
 def own_look(method: Method) -> Look:
     """The one look of a method that is not relightable."""
     return look_of(method, Appearance(), "own light")
+
+
+def with_sky(look: Look, sky: Look) -> Look:
+    """A look with the sky of another; depth and alpha do not depend on either.
+
+    Raises:
+        UserError: The looks are of different scenes, or the method does not tell the sky from the scene.
+    """
+    _require_one_scene([look, sky])
+    if look.method.sky() is None:
+        raise UserError(f"this run of {look.method.label} has no sky apart from the scene; leave --sky out")
+    name = f"{look.name} under the sky of {sky.name}"
+    return Look(name, look.embeddings, look.method, look.note, sky.sky or sky)
 
 
 def mix(
@@ -77,15 +96,22 @@ def mix(
     if not looks:
         raise UserError("a mix needs at least one appearance")
     first = looks[0]
-    if any(look.method is not first.method for look in looks):
-        raise UserError("these appearances belong to different scenes; mix those of one loaded scene")
+    _require_one_scene(looks)
     weights = _checked(looks, weights)
     local = weights if local_weights is None else _checked(looks, local_weights)
     if not first.method.relightable:
         return first
     parts = [look.embeddings for look in looks]
     name = name or _describe(looks, weights, local)
-    return Look(name, first.method.mix(parts, weights, local), first.method)
+    sky = None
+    if any(look.sky for look in looks):
+        sky = mix([look.sky or look for look in looks], weights, local_weights=local)
+    return Look(name, first.method.mix(parts, weights, local), first.method, sky=sky)
+
+
+def _require_one_scene(looks: Sequence[Look]) -> None:
+    if any(look.method is not looks[0].method for look in looks):
+        raise UserError("these appearances belong to different scenes; mix those of one loaded scene")
 
 
 def _checked(looks: Sequence[Look], weights: Sequence[float | int]) -> list[float]:

@@ -56,6 +56,11 @@ class Method(nn.Module, ABC):
     depth_supervised: bool = False
 
     @property
+    def map_columns(self) -> int:
+        """Columns of a colour map."""
+        return 4
+
+    @property
     def basis_size(self) -> int:
         """Number of basis weights of an appearance; 0 for a method that fits none."""
         return 0
@@ -104,6 +109,10 @@ class Method(nn.Module, ABC):
     def num_gaussians(self) -> int:
         """N."""
         return len(self.gaussians)
+
+    def sky(self) -> Bool[Tensor, " N"] | None:
+        """Which Gaussians stand for the sky; None where the method does not tell."""
+        return None
 
     def growable(self) -> Bool[Tensor, " N"] | None:
         """Which Gaussians densification may clone and split; None for all."""
