@@ -115,11 +115,7 @@ def _numba() -> Check:
 
 
 def _cuda_rasterizer() -> Check:
-    """Whether gsplat fits, and whether its CUDA extension is built or can be; builds nothing."""
     import torch
-
-    from wildgs.errors import UserError
-    from wildgs.rasterize import gsplat_library
 
     name = "rasteriser on CUDA"
     if not torch.cuda.is_available():
@@ -128,6 +124,14 @@ def _cuda_rasterizer() -> Check:
             detail = "this build of torch has no CUDA, though the machine has an NVIDIA driver"
             return Check(name, "missing", detail, _pip("torch", "-U --force-reinstall"))
         return Check(name, "missing", detail)
+    return _gsplat(name)
+
+
+def _gsplat(name: str) -> Check:
+    """Whether gsplat fits, and whether its CUDA extension is built or can be; builds nothing."""
+    from wildgs.errors import UserError
+    from wildgs.rasterize import gsplat_library
+
     try:
         gsplat_library.import_gsplat()
     except UserError as error:
