@@ -6,8 +6,8 @@
 # Stages, in this order, where none is named: install build parity eager graphs profile steps render train eval pack.
 # By name only: features (a step without each of WILDGS_WITHOUT's features), tests (all tests marked cuda).
 # Each has a limit, and its results are on disk before the next begins; what fails or runs out of time is in the JSON with
-# its exit code (124: out of time) and the rest goes on. The limits leave the last RESERVE seconds of the budget to
-# training and what follows. An interrupted build or training goes on with a second call and the same OUTPUT.
+# its exit code (124: out of time) and the rest continues. The limits leave the last RESERVE seconds of the budget to
+# training and what follows. An interrupted build or training continues with a second call and the same OUTPUT.
 #
 # --wheels: a folder with wheels of what the machine lacks, for machines without a package index; those are installed
 #   whose package is not there, without their dependencies, so that torch stays as it is. To fill it:

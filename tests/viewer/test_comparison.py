@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.memory_views import make_view
 from wildgs.engine.trainer import Trainer
-from wildgs.viewer.comparison import HIDDEN_TINT, LONG_SIDE, compare, tint_hidden
+from wildgs.viewer.photos import HIDDEN_TINT, LONG_SIDE, compare, tint_hidden
 from wildgs.viewer.subject import Subject
 
 

@@ -1,4 +1,4 @@
-"""A look: one light on the whole scene, shaded once and then as cheap as plain 3D Gaussian Splatting."""
+"""A look: the scene under one appearance, shaded once; mixes of looks, and looks that change over time."""
 
 from __future__ import annotations
 
@@ -133,3 +133,38 @@ def _describe(looks: Sequence[Look], weights: Sequence[float | int], local: Sequ
         )
 
     return sum_of(weights) if weights == local else f"global {sum_of(weights)}, local {sum_of(local)}"
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Looks at even distances over time; between two of them their mix.
+
+    Attributes:
+        looks: At least one; a single one does not change.
+    """
+
+    looks: tuple[Look, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse what shows nothing."""
+        if not self.looks:
+            raise UserError("a video needs at least one appearance")
+
+    @classmethod
+    def of(cls, looks: Look | Sequence[Look]) -> Timeline:
+        """One look, or several over time."""
+        return cls((looks,) if isinstance(looks, Look) else tuple(looks))
+
+    def at(self, share: float) -> Look:
+        """The look at a share of the time, from 0 to 1.
+
+        At the looks themselves no mixing and no new shading takes place.
+        """
+        position = min(max(share, 0.0), 1.0) * (len(self.looks) - 1)
+        index = min(int(position), max(len(self.looks) - 2, 0))
+        amount = position - index
+        if amount < 1e-9:
+            return self.looks[index]
+        if amount > 1 - 1e-9:
+            return self.looks[index + 1]
+        return mix([self.looks[index], self.looks[index + 1]], [1 - amount, amount])

@@ -40,11 +40,7 @@ def save_look(look: Look, file: Path) -> Path:
     tensors = _packed(look.embeddings)
     if look.sky is not None:
         tensors |= {f"{SKY}{name}": values for name, values in _packed(look.sky.embeddings).items()}
-    header = {
-        "format": FORMAT,
-        "name": look.name,
-        "run": look.method.fingerprint(),
-    }
+    header = {"format": FORMAT, "name": look.name, "run": look.method.fingerprint()}
     with written_aside(file) as aside:
         aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
     return file
@@ -67,7 +63,7 @@ def load_look(method: Method, file: Path) -> Look:
         name, owner = str(header["name"]), header["run"]
         if not method.relightable or owner != method.fingerprint():
             raise UserError(
-                f"{file}: was made with another run, or another step of this one; make it anew with "
+                f"{file}: was made with another run, or another step of this one; create it again with "
                 "`wildgs appearance`"
             )
         of_sky = {key.removeprefix(SKY): values for key, values in tensors.items() if key.startswith(SKY)}
@@ -99,12 +95,7 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
 
 
 def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
-    """A file's embeddings for a method's Gaussians.
-
-    Raises:
-        KeyError: One is missing.
-        ValueError: They do not fit the method, or are not finite.
-    """
+    """A file's embeddings for a method's Gaussians; raises `KeyError` or `ValueError` if they do not fit."""
     device = method.gaussians.means.device
     common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
     if common.shape != (method.global_size,):

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
-from wildgs.model.lifting import MIN_ALPHA, liftable
 from wildgs.model.sky import Sky
+from wildgs.model.wrapping import MIN_ALPHA, liftable
 from wildgs.rasterize import Rendering
 
 ROUNDS, TRAINING_ROUNDS = 6, 3

@@ -179,6 +179,22 @@ class LearningRate:
 
 
 @dataclass(frozen=True)
+class MemoryUse:
+    """What training a method takes beside the decoded photos, bytes; `benchmarks/memory.py` measures it.
+
+    Attributes:
+        per_gaussian: Parameters, gradients, Adam's moments, the copies of densification, and the intermediate
+            values of one view.
+        per_pixel: Of the largest photo, at the size at which it trains.
+        fixed: Networks with their moments and activations, and compiled kernels.
+    """
+
+    per_gaussian: int
+    per_pixel: int
+    fixed: int
+
+
+@dataclass(frozen=True)
 class WildGSRates:
     """Learning rates of what plain 3DGS does not have.
 

@@ -12,27 +12,18 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
+from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
-from wildgs.model.gaussians import Gaussians
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.light_basis import LightBasis
-from wildgs.model.method import (
-    GEOMETRY_ROWS,
-    MemoryUse,
-    Method,
-    ParameterGroup,
-    SeenPhoto,
-    Stage,
-    TrainingOutput,
-)
+from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
 from wildgs.model.photo_match import PhotoMatch
-from wildgs.model.rows import paint_visible, take_rows
+from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
-from wildgs.model.wrapping import Wrapping
+from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
 from wildgs.rasterize import Projection, blend
 
 
@@ -48,14 +39,7 @@ class WildGS(Method):
     def __init__(
         self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
     ) -> None:
-        """Sets up a `WildGS`.
-
-        Args:
-            config: The model's configuration.
-            gaussians: With a row `intrinsic` beside the geometry.
-            box: What the triplane covers.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Takes Gaussians with a row `intrinsic`, the triplane's box, and an encoder if not the one configured."""
         super().__init__()
         self.config = config
         self.gaussians = gaussians
@@ -84,13 +68,7 @@ class WildGS(Method):
     def create(
         cls, config: WildGSConfig, initial: InitialGaussians, encoder: Encoder | None = None
     ) -> WildGS:
-        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points.
-
-        Args:
-            config: The model's configuration.
-            initial: The first Gaussians.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points."""
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(initial.points, config.wrapping.box_quantile, ratio)
         intrinsic = torch.zeros(len(initial.colors), config.fusion.intrinsic_size)
@@ -197,7 +175,7 @@ class WildGS(Method):
             return appearance
         intrinsic = self.gaussians.rows["intrinsic"]
         with torch.no_grad():
-            colors = paint_visible(self, projection, appearance, self.sh_degree)
+            colors = self.paint(projection, appearance, self.sh_degree)
             change = self.photo_match.find(
                 photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
             )
@@ -309,7 +287,7 @@ class WildGS(Method):
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
-        colors = paint_visible(self, projection, appearance, stage.sh_degree)
+        colors = self.paint(projection, appearance, stage.sh_degree)
         intrinsic = self.gaussians.rows["intrinsic"]
         rendering = self.photo_match.training_render(
             photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep

@@ -22,12 +22,7 @@ def spread(views: Sequence[View], count: int) -> tuple[View, ...]:
 
 
 class Gallery:
-    """Thumbnails of some photos.
-
-    Attributes:
-        views: The photos offered.
-        names: Theirs.
-    """
+    """Thumbnails of some photos, by name."""
 
     def __init__(self, views: Sequence[View]) -> None:
         self.views = tuple(views)

@@ -1,0 +1,188 @@
+"""The two pages of a run: the report (scores and comparisons), and the page that carries the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wildgs.evaluation.metrics import to_8bit
+from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
+from wildgs.exporters.report import MethodScores, Report, ReportExample, write_report
+from wildgs.exporters.splats import CleanupConfig, Splats, kept_rows
+from wildgs.geometry.trajectory import spread_out
+from wildgs.library.evaluation import Scores
+from wildgs.library.loaded import LoadedScene, find_looks
+from wildgs.light.look import NEUTRAL, Look
+from wildgs.light.photos import encode_view
+from wildgs.model.gaussians import NEAR
+from wildgs.model.method import Method
+from wildgs.progress import Progress
+from wildgs.runs import Run
+from wildgs.scene import Scene, View, match_view
+
+PAGE_LIGHTS = 4
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A written file.
+
+    Attributes:
+        file: Where it was written.
+        megabytes: Its size.
+        num_gaussians: Gaussians in it.
+        sh_degree: Degree of its spherical harmonics.
+        looks: The appearances that it holds: one, or all of the page's.
+    """
+
+    file: Path
+    megabytes: float
+    num_gaussians: int
+    sh_degree: int
+    looks: tuple[Look, ...]
+
+
+@torch.no_grad()
+def write_webpage(
+    loaded: LoadedScene,
+    looks: Sequence[Look],
+    file: Path,
+    *,
+    title: str,
+    cleanup: CleanupConfig | None = None,
+) -> ExportedFile:
+    """Writes the page of a run under some looks, the first of which it opens with; `cleanup` drops Gaussians."""
+    cleanup = cleanup or CleanupConfig()
+    scene = loaded.scene
+    views = scene.train_views or scene.views
+    number, depth = choose_start([view.camera for view in views], scene.points)
+    splats = baked(loaded, looks[0])
+    keep = kept_rows(cleanup, splats, scene.points)
+    lights = [
+        PageLight(look.name, look.sh.cpu().detach()[keep], _thumbnail(loaded, look, views[number]))
+        for look in looks
+    ]
+    page = Page(
+        title=title,
+        summary=f"{int(keep.sum()):,} Gaussians from {len(scene.views)} photos, by Wild-GS.",
+        splats=splats.select(keep),
+        lights=lights,
+        start=PageView(views[number].camera, depth),
+        near=NEAR,
+    )
+    degree = write_page(page, file, viewpoints=viewpoints_of(scene.views), sh_degree=cleanup.sh_degree)
+    return ExportedFile(file, file.stat().st_size / 1e6, len(page.splats), degree, tuple(looks))
+
+
+def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> ExportedFile:
+    """Writes the page of a run under lights chosen for it; ends `wildgs run` and `wildgs demo`."""
+    loaded = LoadedScene(run)
+    return write_webpage(loaded, page_looks(loaded, progress), file, title=title)
+
+
+def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Look]:
+    """The light of a few photos as unlike each other as the scene has them; the one look of plain 3DGS."""
+    if not loaded.relightable:
+        return [loaded.appearance(NEUTRAL)]
+    views = loaded.scene.train_views or loaded.views
+    chosen = different_lights(views, PAGE_LIGHTS)
+    return find_looks(loaded, [view.name for view in chosen], progress=progress)
+
+
+def baked(loaded: LoadedScene, look: Look) -> Splats:
+    """The run's Gaussians under a look, in main memory, in the scene's aligned frame."""
+    gaussians = loaded.gaussians
+    values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, look.sh)
+    return Splats(*(value.detach().cpu().float() for value in values))
+
+
+def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
+    """Camera centres, evenly chosen where there are many."""
+    chosen = views[:: max(1, -(-len(views) // 64))]
+    return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
+
+
+def _thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
+    """The photo whose light it is; where it is none of the scene's, the first view under that light."""
+    view = match_view(loaded.views, look.name)
+    pixels = loaded.render(start.camera, look) if view is None else view.read_photo()
+    return pixels.numpy()
+
+
+EXAMPLES = 4
+LIGHTS = 3
+
+
+def write_showcase(
+    file: Path,
+    title: str,
+    summary: str,
+    scene: Scene,
+    runs: Sequence[tuple[str, Run, Scores]],
+) -> None:
+    """Writes the report of some runs of one scene.
+
+    Args:
+        file: The HTML file.
+        title: Its headline.
+        summary: A paragraph below it.
+        scene: The scene of all runs.
+        runs: Name, run and scores; pictures show the first, and the second as its baseline.
+    """
+    shown = runs[0][1].method
+    baseline = runs[1][1].method if len(runs) > 1 else None
+    views = scene.test_views or scene.train_views
+    chosen = views[:: max(1, -(-len(views) // EXAMPLES))][:EXAMPLES]
+    lights = different_lights(scene.train_views, LIGHTS + 1)
+    with torch.no_grad():
+        examples = tuple(_example(view, lights, shown, baseline) for view in chosen)
+    methods = tuple(MethodScores.from_metrics(name, {**scores}) for name, _, scores in runs if scores)
+    write_report(Report(title, summary, methods, examples), file)
+
+
+def different_lights(views: Sequence[View], count: int) -> list[View]:
+    """Photos as unlike each other in colour as the collection allows; the first is the most usual one."""
+    if not views:
+        return []
+    described = torch.stack([_colour_of(view) for view in views]).double().numpy()
+    return [views[index] for index in spread_out(described, count)]
+
+
+def _colour_of(view: View) -> Tensor:
+    pixels = view.read_photo().float().reshape(-1, 3) / 255
+    return torch.cat([pixels.mean(dim=0), pixels.std(dim=0)])
+
+
+def _example(view: View, lights: Sequence[View], method: Method, baseline: Method | None) -> ReportExample:
+    device = method.gaussians.means.device
+    camera = view.camera.to(device)
+    appearance = encode_view(method, view)
+    rendering = method.render(camera, method.shade(appearance))
+    depth = torch.where(rendering.alpha > 0.5, rendering.depth, 0.0)
+    visibility = appearance.visibility
+    mask = torch.ones_like(depth) if visibility is None else visibility
+    relit = tuple(
+        (light.name, light.read_photo().numpy(), _picture(method, view, light))
+        for light in [light for light in lights if light.name != view.name][:LIGHTS]
+    )
+    clean = view.read_clean() if view.split == "test" else None
+    return ReportExample(
+        name=view.name,
+        photo=view.read_photo().numpy(),
+        render=to_8bit(rendering.colors).cpu().numpy(),
+        mask=(mask * 255).byte().cpu().numpy(),
+        depth=depth.cpu().numpy(),
+        clean=None if clean is None else clean.numpy(),
+        baseline=None if baseline is None else _picture(baseline, view, view),
+        relit=relit,
+    )
+
+
+def _picture(method: Method, view: View, light: View) -> np.ndarray:
+    sh = method.shade(encode_view(method, light))
+    return to_8bit(method.render(view.camera.to(sh.device), sh).colors).cpu().numpy()
