@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from wildgs.evaluation.photos import find_misfits, read_photos
 from wildgs.exporters.cleanup import CleanupConfig, kept_rows
 from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
 from wildgs.exporters.splats import Splats
 from wildgs.library.loaded import LoadedScene
 from wildgs.library.looks import find_looks
-from wildgs.library.showcase import different_lights
+from wildgs.library.showcase import different_lights, without
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.model.gaussians import NEAR
 from wildgs.progress import Progress
@@ -95,7 +96,8 @@ def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Lo
     if not loaded.relightable:
         return [loaded.appearance(NEUTRAL)]
     views = loaded.scene.train_views or loaded.views
-    chosen = different_lights(views, PAGE_LIGHTS)
+    misfits = find_misfits(read_photos(loaded.run.folder, loaded.run.step) or [])
+    chosen = different_lights(without(views, misfits), PAGE_LIGHTS)
     return find_looks(loaded, [view.name for view in chosen], progress=progress)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.evaluation.metrics import psnr
-from wildgs.exporters.depth_colors import color_depth
+from wildgs.exporters.depth_colors import color_depth, tint_hidden
 from wildgs.light.look import Look
 from wildgs.scene import View
 from wildgs.viewer.subject import Subject
@@ -18,7 +18,6 @@ from wildgs.viewer.subject import Subject
 LONG_SIDE = 480
 """Pictures are computed no larger: they are shown small."""
 
-HIDDEN_TINT = np.array([230.0, 40.0, 40.0])
 Picture = UInt8[np.ndarray, "H W 3"]
 
 
@@ -65,13 +64,6 @@ def compare(subject: Subject, view: View, look: Look) -> Comparison:
         psnr=psnr(render, photo),
         light=look.name,
     )
-
-
-def tint_hidden(photo: Picture, visibility: Float[np.ndarray, "H W"]) -> Picture:
-    """The photo, greyed, with red where visibility is low."""
-    grey = photo.mean(axis=2, keepdims=True).repeat(3, axis=2)
-    hidden = (1 - np.clip(visibility, 0, 1))[..., None]
-    return ((1 - 0.8 * hidden) * grey + 0.8 * hidden * HIDDEN_TINT).round().astype(np.uint8)
 
 
 def _resized(photo: UInt8[Tensor, "H W 3"], width: int, height: int) -> UInt8[Tensor, "h w 3"]:

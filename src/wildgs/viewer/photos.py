@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from wildgs.files import printable
 from wildgs.scene import View
 from wildgs.viewer.cameras import fov_that_holds, pose_of
@@ -46,6 +48,7 @@ class PhotoPanel:
         self._by_label = {printable(view.name): view for view in views}
         self.current: View | None = None
         self._frustums: dict[str, viser.CameraFrustumHandle] = {}
+        self._shown: dict[str, np.ndarray] = {}
         gui = server.gui
         # Not shown at first: at a photo's viewpoint, the photos of others stand in the way.
         self.parent = server.scene.add_frame(PARENT, show_axes=False, visible=False)
@@ -69,10 +72,14 @@ class PhotoPanel:
         self.refresh()
 
     def refresh(self) -> None:
-        """Adds frustums for the photos whose thumbnails are there."""
+        """Adds frustums for the photos whose thumbnails are there, and shows those that changed."""
         for view in self._gallery.views:
             picture = self._gallery.picture(view.name)
-            if picture is None or view.name in self._frustums:
+            if picture is None or picture is self._shown.get(view.name):
+                continue
+            self._shown[view.name] = picture
+            if view.name in self._frustums:
+                self._frustums[view.name].image = picture
                 continue
             pose = pose_of(view.camera)
             frustum = self._server.scene.add_camera_frustum(
