@@ -28,7 +28,7 @@ folder_of() {
 torch=$(folder_of torch) gsplat=$(folder_of gsplat)/cuda
 mkdir -p "$output"
 log=$output/log
-: >"$log"
+echo "# $(date -u +%FT%TZ) gsplat $gsplat, nvcc $(nvcc --version | sed -n "s,.*release \([0-9.]*\).*,\1,p")" >>"$log"
 includes=(-I"$gsplat/include" -I"$gsplat/csrc/third_party/glm" -I"$torch/include"
   -I"$torch/include/torch/csrc/api/include" -I"$("$python" -c 'import sysconfig; print(sysconfig.get_path("include"))')")
 for headers in "$(dirname "$torch")"/nvidia/*/include; do

@@ -181,7 +181,7 @@ def make_trainer(
     team: Team | None = None,
     graphs: bool = True,
 ) -> Trainer:
-    """A trainer at the start of the second stage, with N Gaussians."""
+    """A trainer in the second stage, past the reset at its start after which the mask does not learn."""
     generator = torch.Generator().manual_seed(0)
     source = torch.randint(len(scene.points), (n,), generator=generator)
     noise = 0.02 * torch.randn(n, 3, generator=generator)
@@ -193,7 +193,8 @@ def make_trainer(
     trainer = Trainer(method.to(device), scene, config, team)
     trainer.cuda_graphs = graphs
     trainer.begin()
-    trainer.step = trainer.schedule.first_stage + 1
+    schedule = trainer.schedule
+    trainer.step = schedule.first_stage + schedule.mask_pause + 1
     return trainer
 
 

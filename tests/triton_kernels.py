@@ -1,4 +1,4 @@
-"""Compares Triton kernels with the CPU's, by Triton's interpreter; test_triton runs it in a process of its own."""
+"""Compares Triton kernels with the CPU's by Triton's interpreter, and compiles them; test_triton runs it."""
 
 from __future__ import annotations
 
@@ -39,5 +39,38 @@ def compare_planes() -> None:
         torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-4)
 
 
+SIZES = ("count", "length", "channels", "resolution")
+
+
+def compile_all() -> None:
+    """To machine code, with no GPU: sizes as int32, and once as the constant 1, as which Triton takes a 1."""
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    from wildgs.losses import ssim_triton
+    from wildgs.model import triplane_triton
+
+    for module in (ssim_triton, triplane_triton):
+        constants = {"BLOCK": ssim_triton.BLOCK, "POINTS": triplane_triton.POINTS, "WIDTH": 32}
+        for name, kernel in vars(module).items():
+            if not isinstance(kernel, triton.runtime.JITFunction) or not constants.keys() & {
+                *kernel.arg_names
+            }:
+                continue
+            given = {arg: constants[arg] for arg in kernel.arg_names if arg in constants}
+            for ones in ({}, {arg: 1 for arg in ("resolution", "channels") if arg in kernel.arg_names}):
+                fixed = given | ones
+                signature = {
+                    arg: "constexpr" if arg in fixed else "i32" if arg in SIZES else "*fp32"
+                    for arg in kernel.arg_names
+                }
+                for capability in (80, 90):
+                    source = ASTSource(kernel, signature, constexprs=fixed)
+                    made = triton.compile(source, target=GPUTarget("cuda", capability, 32))
+                    print(name, sorted(ones), f"sm_{capability}", len(made.asm["cubin"]), "bytes")
+                    assert made.asm["cubin"]
+
+
 if __name__ == "__main__":
-    {"ssim": compare_ssim, "planes": compare_planes}[sys.argv[1]]()
+    {"ssim": compare_ssim, "planes": compare_planes, "compile": compile_all}[sys.argv[1]]()

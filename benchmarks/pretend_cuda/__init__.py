@@ -1,16 +1,13 @@
 """A device that says it is CUDA and computes on the CPU: counts what a GPU would be told to do, without one.
 
-Tensors on it are real, so whole training steps run, and it counts how many kernels a step launches and where the
-host waits for the device. It says nothing about times, streams, graph capture or gsplat's interface; tests check
-those against torch and the installed gsplat.
+Tensors on it are real, so whole trainings run, and it counts how many kernels a step launches and where the host
+waits for the device; operands on two devices are an error, and so is a wait while a graph is captured. It says
+nothing about times, streams or gsplat's kernels.
 
     import pretend_cuda
     pretend_cuda.prepare()          # before torch is imported; needs g++
     with pretend_cuda.device() as record:
         ...                         # torch.device("cuda") exists in here
-
-`prepare` gives a build of torch without CUDA the little that its autograd engine asks of an accelerator: that there
-is one, and that it has one stream.
 """
 
 from __future__ import annotations
@@ -27,9 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pretend_cuda.tensors import Record
-
-SOURCE = Path(__file__).with_name("device.cpp")
+    from .tensors import Record
 
 
 def prepare() -> None:
@@ -46,14 +41,14 @@ def prepare() -> None:
     spec = importlib.util.find_spec("torch")
     if spec is None or spec.origin is None:
         raise SystemExit("there is no torch")
-    torch_folder = Path(spec.origin).parent
-    if (torch_folder / "lib" / "libtorch_cuda.so").exists():
+    folder = Path(spec.origin).parent
+    if (folder / "lib" / "libtorch_cuda.so").exists():
         raise SystemExit("this torch has CUDA itself; pretending is for builds that have not")
-    core = torch_folder / "lib" / "libc10.so"
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "device.so"
-        flags = ["-std=c++20", "-O1", "-shared", "-fPIC", f"-I{torch_folder / 'include'}"]
-        subprocess.run([compiler, *flags, str(SOURCE), "-o", str(library), str(core)], check=True)
+    source, core = Path(__file__).with_name("device.cpp"), folder / "lib" / "libc10.so"
+    with tempfile.TemporaryDirectory() as made:
+        library = Path(made) / "device.so"
+        flags = ["-std=c++20", "-O0", "-shared", "-fPIC", f"-I{folder / 'include'}"]
+        subprocess.run([compiler, *flags, str(source), "-o", str(library), str(core)], check=True)
         # First of all: what torch's libraries look up, they find here before they find their own.
         ctypes.CDLL(str(core), ctypes.RTLD_GLOBAL)
         ctypes.CDLL(str(library), ctypes.RTLD_GLOBAL)
@@ -61,6 +56,6 @@ def prepare() -> None:
 
 def device() -> AbstractContextManager[Record]:
     """While this is open, `torch.device("cuda")` exists and gsplat is there; gives the record of what it does."""
-    from pretend_cuda.tensors import pretend
+    from .tensors import pretend
 
     return pretend()

@@ -11,10 +11,11 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils._python_dispatch import _disable_current_modes
 
-from pretend_cuda.tensors import RECORD, Pretended
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import sh_basis
 from wildgs.rasterize import Projection, blend, project
+
+from .tensors import RECORD, Pretended
 
 
 class _Kernel(torch.autograd.Function):

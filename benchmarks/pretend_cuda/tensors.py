@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
@@ -17,41 +17,17 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 CUDA = torch.device("cuda", 0)
-FREE = frozenset(
-    (
-        "view",
-        "_unsafe_view",
-        "permute",
-        "transpose",
-        "t",
-        "expand",
-        "slice",
-        "select",
-        "unsqueeze",
-        "squeeze",
-        "detach",
-        "alias",
-        "as_strided",
-        "unbind",
-        "split",
-        "split_with_sizes",
-        "reshape",
-        "_reshape_alias",
-        "empty",
-        "empty_like",
-        "empty_strided",
-        "new_empty",
-        "new_empty_strided",
-        "lift_fresh",
-        "diagonal",
-        "unfold",
-        "resize_",
-        "_local_scalar_dense",
-    )
-)
+FREE = frozenset((
+    "view", "_unsafe_view", "permute", "transpose", "t", "expand", "slice", "select", "unsqueeze",
+    "squeeze", "detach", "alias", "as_strided", "unbind", "split", "split_with_sizes", "reshape",
+    "_reshape_alias", "empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided",
+    "lift_fresh", "diagonal", "unfold", "resize_", "_local_scalar_dense",
+))  # fmt: skip
 """Operations that launch nothing."""
 COUNTING = frozenset(("nonzero", "masked_select", "repeat_interleave", "_unique2", "equal", "is_nonzero"))
 """Operations after which the host waits: for the size of the result, or for the result."""
+CARRYING = frozenset(("_to_copy", "copy_", "_copy_from", "_foreach_copy_"))
+"""Operations that take tensors of several devices."""
 
 
 @dataclass
@@ -70,6 +46,7 @@ class Record:
     bytes: int = 0
     graphs: int = 0
     paused: bool = False
+    capturing: bool = False
 
     def clear(self) -> None:
         """Begins anew."""
@@ -84,7 +61,13 @@ class Record:
             self.bytes += size
 
     def wait(self, name: str) -> None:
-        """The host waits."""
+        """The host waits.
+
+        Raises:
+            RuntimeError: A graph is being captured.
+        """
+        if self.capturing:
+            raise RuntimeError(f"operation not permitted when stream is capturing: {name}, {_line()}")
         if not self.paused:
             self.waits[f"{name}, {_line()}"] += 1
 
@@ -162,15 +145,19 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     concerned = bool(there) or _is_cuda(device)
     if concerned:
         _note_waits(name, args, kwargs, here, downloads)
-    result = function(*tree_map(_inner, args), **tree_map(_inner, _without_pinning(kwargs)))
+    pinned = kwargs.get("pin_memory")
+    kwargs = {key: _inner(value) for key, value in kwargs.items() if key != "pin_memory"}
+    result = function(*tree_map(_inner, args), **kwargs)
     if not concerned or downloads:
+        if pinned:
+            result.pinned = True
         return result
-    known = {id(tensor.inner): tensor for tensor in there}
+    # What an operation changed in place is the tensor that it was given.
+    known = {id(_inner(tensor)): tensor for tensor in tensors}
 
     def wrapped(leaf: Any) -> Any:
         if not isinstance(leaf, Tensor) or isinstance(leaf, Pretended):
             return leaf
-        # What an operation changed in place is the tensor that it was given.
         return known[id(leaf)] if id(leaf) in known else Pretended(leaf)
 
     if name not in FREE:
@@ -191,19 +178,22 @@ def _inner(leaf: Any) -> Any:
     return leaf
 
 
-def _without_pinning(kwargs: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in kwargs.items() if name != "pin_memory"}
-
-
 def _note_waits(name: str, args: Any, kwargs: dict[str, Any], here: list[Tensor], downloads: bool) -> None:
+    if here and name not in CARRYING and not name.startswith("index"):
+        shapes = ", ".join(str(tuple(tensor.shape)) for tensor in here)
+        raise RuntimeError(f"{name}: tensors on cuda and on the CPU (shapes {shapes}), {_line()}")
     if name == "_local_scalar_dense":
         RECORD.wait("a number read")
     elif downloads:
         RECORD.wait("a tensor read")
     elif name in COUNTING or _has_boolean_index(name, args):
         RECORD.wait(name)
-    elif here and not (kwargs.get("non_blocking") and all(getattr(t, "pinned", False) for t in here)):
+    elif here and not (_non_blocking(args, kwargs) and all(getattr(t, "pinned", False) for t in here)):
         RECORD.wait("a tensor written")
+
+
+def _non_blocking(args: Any, kwargs: dict[str, Any]) -> bool:
+    return bool(kwargs.get("non_blocking")) or (len(args) == 3 and args[2] is True)
 
 
 def _has_boolean_index(name: str, args: Any) -> bool:
@@ -227,12 +217,22 @@ def _tensor(data: Any, *args: Any, device: Any = None, **kwargs: Any) -> Tensor:
     return made.to(device) if _is_cuda(device) else made
 
 
+class _Event:
+    """Stands for `torch.cuda.Event`; what it marks is done already."""
+
+    def record(self) -> None: ...
+
+    def synchronize(self) -> None: ...
+
+
 @contextmanager
 def pretend() -> Iterator[Record]:
     """See `pretend_cuda.device`."""
-    from pretend_cuda import graphs
-    from pretend_cuda.gsplat import StandIn
+    from wildgs import features
     from wildgs.rasterize import cuda as backend
+
+    from . import graphs
+    from .gsplat import StandIn
 
     gsplat = StandIn()
     torch.__future__.set_overwrite_module_params_on_conversion(True)
@@ -246,7 +246,7 @@ def pretend() -> Iterator[Record]:
             (torch.cuda, "is_available", lambda: True),
             (torch.cuda, "_lazy_init", lambda: None),
             (torch.cuda, "is_bf16_supported", lambda **_: True),
-            (torch.cuda, "synchronize", lambda *_: None),
+            (torch.cuda, "synchronize", lambda *_: RECORD.wait("synchronize")),
             (torch.cuda, "get_device_capability", lambda *_: (9, 0)),
             (torch.cuda, "get_rng_state", lambda *_: torch.get_rng_state()),
             (torch.cuda, "set_rng_state", lambda *_: None),
@@ -254,9 +254,15 @@ def pretend() -> Iterator[Record]:
             (torch.cuda, "max_memory_allocated", lambda *_: 0),
             (torch.cuda, "empty_cache", lambda: None),
             (torch.cuda, "get_device_name", lambda *_: "no GPU, pretended"),
+            (torch.cuda, "Event", _Event),
+            (torch.cuda, "Stream", lambda *_: None),
+            (torch.cuda, "current_stream", lambda *_: None),
+            (torch.cuda, "stream", nullcontext),
+            (torch.cuda, "CUDAGraph", graphs.CUDAGraph),
+            (torch.cuda, "graph", graphs.graph),
             (torch.cuda, "graph_pool_handle", graphs.graph_pool_handle),
-            (torch.cuda, "make_graphed_callables", graphs.make_graphed_callables),
             (backend, "load_gsplat", lambda: gsplat),
+            (features, "_runs_triton", lambda: False),
         ):
             stack.enter_context(patch.object(target, name, value))
         try:

@@ -44,6 +44,20 @@ def round_of(control: DensityControl, method: VanillaGS, optimizers: Optimizers,
     return control.densify(method.gaussians, optimizers.rows, generator, prune_large=large)
 
 
+def test_what_may_not_grow_leaves_the_budget_to_others(method: VanillaGS) -> None:
+    control, optimizers = controlled(method, [1e-2, 1e-2, 0.0, 1e-3], max_gaussians=5, prune_opacity=0.0)
+    means = method.gaussians.means.detach().clone()
+    report = control.densify(
+        method.gaussians,
+        optimizers.rows,
+        torch.Generator().manual_seed(0),
+        prune_large=False,
+        growable=torch.tensor([False, False, True, True]),
+    )
+    assert (report.cloned, report.split, report.pruned) == (1, 0, 0)
+    assert torch.equal(method.gaussians.means.detach(), means[[0, 1, 2, 3, 3]])
+
+
 def test_small_clones_large_splits_faint_goes(method: VanillaGS) -> None:
     means = method.gaussians.means.detach().clone()
     control, optimizers = controlled(method, [1e-3, 1e-3, 1e-3, 0.0])

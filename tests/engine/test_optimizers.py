@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from wildgs.engine import optimizers as optimizers_module
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers, edit_rows, reset_moments
 from wildgs.model.vanilla import VanillaConfig, VanillaGS
 
@@ -45,6 +46,34 @@ def test_rows_and_moments_stay_aligned(kept: list[bool], added: int) -> None:
         assert torch.equal(state[: int(keep.sum())], old_moments[name][keep])
         assert state[int(keep.sum()) :].abs().sum() == 0
     assert len(optimizers.rows.state) == len(before)
+
+
+@pytest.mark.parametrize(("kept", "added"), [(12, 0), (7, 5), (0, 3)])
+def test_sorting_while_editing_moves_every_tensor_once_and_to_the_same_place(
+    monkeypatch, kept: int, added: int
+) -> None:
+    found, moved = [], []
+    for without in ("densify_once", ""):
+        monkeypatch.setenv("WILDGS_WITHOUT", without)
+        method, optimizers = trained_baseline()
+        torch.manual_seed(1)
+        new = {name: torch.randn(added, *rows.shape[1:]) for name, rows in method.gaussians.rows.items()}
+        changes: list[str] = []
+        change = optimizers_module._change_rows
+        monkeypatch.setattr(
+            optimizers_module,
+            "_change_rows",
+            lambda *args: (changes.append("all"), change(*args))[1],  # noqa: B023
+        )
+        edit_rows(method.gaussians, optimizers.rows, torch.arange(12) < kept, new, sort=True)
+        monkeypatch.setattr(optimizers_module, "_change_rows", change)
+        moved.append(len(changes))
+        found.append(optimizers.state() | {f"row.{n}": r.detach() for n, r in method.gaussians.rows.items()})
+    assert moved == [2, 1]
+    assert found[0].keys() == found[1].keys()
+    for name, wanted in found[0].items():
+        assert torch.equal(found[1][name], wanted), name
+    assert len(method.gaussians) == kept + added
 
 
 def test_training_goes_on_after_an_edit() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,9 +45,13 @@ def spoil_losses(trainer: Trainer, bad: set[int], monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(trainer, "_forward", spoiled)
 
 
+@pytest.mark.parametrize("on_device", [False, True])
 @pytest.mark.parametrize("gradient", [False, True])
-def test_a_bad_step_is_skipped_and_named(wall_scene: Scene, monkeypatch, gradient: bool) -> None:
+def test_a_bad_step_is_skipped_and_named(
+    wall_scene: Scene, monkeypatch, gradient: bool, on_device: bool
+) -> None:
     trainer = trainer_for(wall_scene, 6)
+    trainer.skips_on_device = on_device
     spoil_losses(trainer, {2, 4}, monkeypatch, gradient=gradient)
     seen: list[tuple[int, str | None]] = []
     means = []
@@ -60,7 +65,8 @@ def test_a_bad_step_is_skipped_and_named(wall_scene: Scene, monkeypatch, gradien
     ) as caught:
         trainer.run([watch])
     assert len(caught) == 2
-    assert [step for step, skipped in seen if skipped] == [3, 5]
+    assert [step for step, skipped in seen if skipped] == ([4, 6] if on_device else [3, 5])
+    assert {str(w.message).partition(",")[0] for w in caught} == {"step 3", "step 5"}
     assert torch.equal(means[1], means[2]), "nothing is learnt from it"
     assert not torch.equal(means[2], means[3])
     assert trainer.guard.skipped == 2
@@ -70,8 +76,10 @@ def test_a_bad_step_is_skipped_and_named(wall_scene: Scene, monkeypatch, gradien
     assert again.guard.skipped == 2
 
 
-def test_ten_bad_steps_in_a_row_end_the_run(wall_scene: Scene, monkeypatch) -> None:
+@pytest.mark.parametrize("on_device", [False, True])
+def test_ten_bad_steps_in_a_row_end_the_run(wall_scene: Scene, monkeypatch, on_device: bool) -> None:
     trainer = trainer_for(wall_scene, 40)
+    trainer.skips_on_device = on_device
     spoil_losses(trainer, set(range(5, 40)), monkeypatch)
     saved: list[int] = []
     autosave = Autosave(lambda: saved.append(trainer.step), every=1)
@@ -81,7 +89,40 @@ def test_ten_bad_steps_in_a_row_end_the_run(wall_scene: Scene, monkeypatch) -> N
     ):
         trainer.run([autosave])
     assert trainer.guard.in_a_row == PATIENCE
-    assert saved == [1, 2, 3, 4, 5], "nothing is saved while steps fail"
+    assert saved == [*range(1, 6 + on_device)], "nothing is saved while steps are known to fail"
+
+
+@pytest.mark.parametrize("bad", [set(), {2, 3, 7}])
+def test_adam_that_skips_by_itself_learns_what_a_judged_one_learns(
+    wall_scene: Scene, monkeypatch, bad: set[int]
+) -> None:
+    states = []
+    for on_device in (False, True):
+        trainer = trainer_for(wall_scene, 9)
+        trainer.skips_on_device = on_device
+        trainer.schedule.densify_from, trainer.schedule.densify_every = 3, 2
+        spoil_losses(trainer, bad, monkeypatch)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", WildGSWarning)
+            trainer.run([])
+        states.append(trainer.state())
+    for name, wanted in states[0].items():
+        if name != "progress.seconds":
+            assert torch.equal(states[1][name], wanted), name
+
+
+def test_a_bad_step_counts_before_the_host_has_heard_of_it(wall_scene: Scene, monkeypatch) -> None:
+    trainer = trainer_for(wall_scene, 6)
+    trainer.skips_on_device = True
+    spoil_losses(trainer, {1}, monkeypatch)
+    trainer.begin()
+    for _ in range(2):
+        trainer.advance()
+    assert int(trainer.state()["progress.skipped"]) == 1
+    with pytest.warns(WildGSWarning, match="step 2, photo"):
+        trainer.advance()
+    assert trainer.guard.skipped == 1
+    trainer.end()
 
 
 def test_the_diagnosis_names_broken_parameters(wall_scene: Scene) -> None:

@@ -1,3 +1,6 @@
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +16,7 @@ from wildgs.losses.evidence import (
     transient_evidence,
 )
 from wildgs.losses.photometric import masked_photometric
-from wildgs.losses.ssim import _ConvolutionSSIM, gaussian_taps, ssim
+from wildgs.losses.ssim import _ConvolutionSSIM, gaussian_taps, ssim, ssim_map
 
 
 def naive_ssim(x: np.ndarray, y: np.ndarray) -> float:
@@ -258,17 +261,36 @@ def test_hiding_a_wrong_region_lowers_the_loss():
     assert visibility.grad[10:22, 10:22].mean() > 10 * visibility.grad[0:2].abs().mean()
 
 
-def test_convolutions_never_run_in_tf32(monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def precision() -> Iterator[Any]:
+    """Torch's setting for cuDNN's convolutions."""
+    setting: Any = torch.backends.cudnn.conv
+    before = setting.fp32_precision
+    yield setting
+    setting.fp32_precision = before
+
+
+def test_convolutions_run_where_the_user_set_the_precision_of_some(precision: Any):
+    """torch refuses to read its older setting after that (`allow_tf32`)."""
+    precision.fp32_precision = "ieee"
+    with pytest.raises(RuntimeError, match="mix of the legacy and new"):
+        assert torch.backends.cudnn.allow_tf32
+    picture = torch.rand(12, 14, 3)
+    torch.testing.assert_close(ssim_map(picture, picture), torch.ones_like(picture))
+    assert precision.fp32_precision == "ieee"
+
+
+def test_convolutions_never_run_in_tf32(monkeypatch: pytest.MonkeyPatch, precision: Any):
     """E[x^2] - E[x]^2 cancels with ten bits of mantissa; neither value nor gradient may be computed so."""
     convolve = torch.nn.functional.conv2d
 
     def rounds_as_tensor_cores_do(x: torch.Tensor, weight: torch.Tensor, **options):
-        if torch.backends.cudnn.allow_tf32:
+        if precision.fp32_precision == "tf32":
             x, weight = ((t.view(torch.int32) + 0x1000 & -0x2000).view(torch.float32) for t in (x, weight))
         return convolve(x, weight, **options)
 
     monkeypatch.setattr(torch.nn.functional, "conv2d", rounds_as_tensor_cores_do)
-    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    precision.fp32_precision = "tf32"
     generator = torch.Generator().manual_seed(0)
     x = 0.7 + 0.02 * torch.rand(24, 32, 3, generator=generator)
     y = x + 0.004 * torch.rand(24, 32, 3, generator=generator)
@@ -278,7 +300,7 @@ def test_convolutions_never_run_in_tf32(monkeypatch: pytest.MonkeyPatch):
     gradients = [torch.autograd.grad(value, leaves) for value in (found, wanted)]
     for one, other in zip(*gradients, strict=True):
         assert float((one - other).norm() / other.norm()) < 0.01
-    assert torch.backends.cudnn.allow_tf32
+    assert precision.fp32_precision == "tf32"
 
 
 def test_convolutions_stay_on_their_device():

@@ -11,11 +11,14 @@ from wildgs.geometry.spherical_harmonics import C0
 from wildgs.model.color_match import (
     LEAST_PIXELS,
     SKY_COLUMNS,
+    changed_harmonics,
+    changed_picture,
     elevation_powers,
     mapped,
     match_colors,
     match_sky,
 )
+from wildgs.model.sky import Sky
 
 
 def changed(colors: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
@@ -85,3 +88,16 @@ def test_mapped_harmonics_are_those_of_mapped_colours() -> None:
     colors = torch.einsum("k, vkc -> vc", basis, harmonics) + 0.5
     found = torch.einsum("k, vkc -> vc", basis, mapped(harmonics, change, offset)) + 0.5
     torch.testing.assert_close(found, changed(colors, change) + offset)
+
+
+def test_a_changed_picture_is_the_picture_of_changed_harmonics() -> None:
+    generator = torch.Generator().manual_seed(0)
+    colors = torch.rand(24, 30, 3, generator=generator)
+    sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
+    sky = Sky(sine > 0.4, sine)
+    change = 0.2 * (torch.rand(3, 4 + SKY_COLUMNS, generator=generator) - 0.5)
+    flat = ((colors - 0.5) / C0).reshape(-1, 1, 3)
+    rows = Sky(sky.which.reshape(-1), sky.sine.reshape(-1))
+    expected = (C0 * changed_harmonics(flat, change, rows) + 0.5).reshape(colors.shape)
+    torch.testing.assert_close(changed_picture(colors, change, sky), expected)
+    torch.testing.assert_close(changed_picture(colors, change[:, :4], None), changed(colors, change[:, :4]))

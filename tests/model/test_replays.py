@@ -1,17 +1,24 @@
-"""What is recorded when, and what happens where it cannot be. Recording itself needs CUDA; see test_gpu_path."""
+"""What is recorded when, what a replay gives, and what happens where nothing can be recorded.
+
+Recording itself needs CUDA; here `benchmarks/pretend_cuda` notes a network's operations and does them again.
+"""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from contextlib import contextmanager, nullcontext
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
+from benchmarks.pretend_cuda import graphs
 from wildgs.errors import WildGSWarning
 from wildgs.model import replays as replays_module
-from wildgs.model.replays import EAGER_CALLS, MOST_GRAPHS, Replays
+from wildgs.model.parsing import Parsing
+from wildgs.model.replays import EAGER_CALLS, MOST_GRAPHS, Recording, Replays
+from wildgs.model.wildgs import WildGSConfig
 
 
 class OnCuda(Tensor):
@@ -21,8 +28,28 @@ class OnCuda(Tensor):
 
 
 @pytest.fixture(autouse=True)
-def memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 1))
+def recorded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Torch's recorder, emulated; gives the capture mode of every graph that was captured."""
+    modes: list[str] = []
+
+    @contextmanager
+    def graph(captured: graphs.CUDAGraph, *, pool: Any, capture_error_mode: str):
+        assert pool == (0, 1)
+        with graphs.graph(captured, pool=pool, capture_error_mode=capture_error_mode):
+            yield
+        modes.append(capture_error_mode)
+
+    for name, value in {
+        "graph_pool_handle": lambda: (0, 1),
+        "synchronize": lambda: None,
+        "Stream": lambda: None,
+        "current_stream": lambda: None,
+        "stream": nullcontext,
+        "CUDAGraph": graphs.CUDAGraph,
+        "graph": graph,
+    }.items():
+        monkeypatch.setattr(torch.cuda, name, value)
+    return modes
 
 
 @pytest.fixture
@@ -31,66 +58,133 @@ def layer() -> nn.Linear:
     return nn.Linear(3, 2)
 
 
-def recorder(change: Callable[[Tensor], Tensor] = lambda output: output):
-    """Stands for torch's recorder; what it records has its outputs changed."""
-    recorded = []
-
-    def record(part, example, allow_unused_input, pool):
-        recorded.append(tuple(example[0].shape))
-        assert allow_unused_input
-        assert pool == (0, 1)
-        return lambda x: tuple(change(output) for output in part(x))
-
-    return record, recorded
+@pytest.fixture
+def replays() -> Replays:
+    made = Replays()
+    made.switch(True)
+    return made
 
 
-def call(replays: Replays, layer: nn.Linear, rows: int = 4, scale: float = 1.0) -> Tensor:
-    x = torch.linspace(-1, 1, 3 * rows).reshape(rows, 3).as_subclass(OnCuda)
+def call(
+    replays: Replays, layer: nn.Module, rows: int = 4, scale: float = 1.0, start: float = -1.0
+) -> Tensor:
+    x = torch.linspace(start, 1, 3 * rows).reshape(rows, 3).as_subclass(OnCuda)
     (output,) = replays(lambda x, scale: (layer(x) * scale,), (layer,), x, (scale,))
     return output.as_subclass(Tensor)
 
 
-def test_a_shape_that_comes_again_is_recorded_once(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
-    record, recorded = recorder()
-    monkeypatch.setattr(torch.cuda, "make_graphed_callables", record)
-    replays = Replays()
+def test_a_shape_that_comes_again_is_recorded_once(replays: Replays, layer: nn.Linear, recorded: list[str]):
+    replays.switch(False)
     call(replays, layer)
     replays.switch(True)
     wanted = [call(replays, layer) for _ in range(EAGER_CALLS)]
-    assert recorded == []
+    assert replays.recorded == 0
     for _ in range(3):
         torch.testing.assert_close(call(replays, layer), wanted[0])
-    assert recorded == [(4, 3)]
+    assert replays.recorded == 1
+    # Only this thread's calls can fail a capture: others decode photos and write checkpoints meanwhile.
+    assert recorded == ["thread_local"] * 2
     for _ in range(EAGER_CALLS + 1):
         call(replays, layer, rows=5)
         call(replays, layer, scale=2.0)
-    assert recorded == [(4, 3), (5, 3), (4, 3)]
-    call(replays, layer).sum().backward()
-    assert layer.weight.grad is not None
+    assert replays.recorded == 3
     replays.switch(True)
     call(replays, layer)
-    assert len(recorded) == 3
+    assert replays.recorded == 0
 
 
-def test_no_gradient_no_graph_and_not_without_end(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
-    record, recorded = recorder()
-    monkeypatch.setattr(torch.cuda, "make_graphed_callables", record)
-    replays = Replays()
-    replays.switch(True)
+@pytest.mark.parametrize("without", ["", "written_gradients"])
+def test_a_replay_trains_as_the_network_does(
+    replays: Replays, layer: nn.Linear, monkeypatch: pytest.MonkeyPatch, without: str
+):
+    """Other inputs than those of the recording, and weights that learn meanwhile."""
+    monkeypatch.setenv("WILDGS_WITHOUT", without)
+    twin, off = copy.deepcopy(layer), Replays()
+    for each, network in ((replays, layer), (off, twin)):
+        optimizer = torch.optim.Adam(network.parameters(), lr=0.1, fused=True)
+        for step in range(8):
+            call(each, network, start=-step).square().sum().backward()
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+    assert replays.recorded == 1
+    torch.testing.assert_close(layer.weight, twin.weight, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(layer.bias, twin.bias, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("without", ["", "written_gradients"])
+def test_gradients_of_two_replays_add_up(
+    replays: Replays, layer: nn.Linear, monkeypatch: pytest.MonkeyPatch, without: str
+):
+    monkeypatch.setenv("WILDGS_WITHOUT", without)
+    twin, off = copy.deepcopy(layer), Replays()
+    for _ in range(EAGER_CALLS + 1):
+        call(replays, layer)
+    for each, network in ((replays, layer), (off, twin)):
+        for start in (-1.0, -3.0):
+            call(each, network, start=start).square().sum().backward()
+    torch.testing.assert_close(layer.weight.grad, twin.weight.grad)
+
+
+def test_no_accumulator_of_an_eager_step_takes_part_and_none_runs_in_a_replay(
+    replays: Replays, layer: nn.Linear
+):
+    """An accumulator that an eager step left is bound to that step's stream, which would invalidate a capture."""
+    kept = [call(replays, layer) for _ in range(EAGER_CALLS)]
+    accumulator = torch.autograd.graph.get_gradient_edge(layer.weight).node
+    ran: list[str] = []
+    accumulator.register_prehook(lambda *_: ran.append("accumulator"))
+    call(replays, layer).sum().backward()
+    assert replays.recorded == 1
+    ran.clear()  # of the eager pass with which the recording was compared
+    call(replays, layer).sum().backward()
+    assert layer.weight.grad is not None
+    assert not ran
+    del kept
+
+
+def test_gradients_lie_as_their_parameters_do(replays: Replays):
+    """Fused Adam takes both as they lie in memory."""
+    torch.manual_seed(0)
+    network = nn.Conv2d(4, 6, 3).to(memory_format=torch.channels_last)
+    x = torch.randn(1, 4, 8, 8).as_subclass(OnCuda)
+    for _ in range(EAGER_CALLS + 2):
+        network.zero_grad(set_to_none=True)
+        replays(lambda x: (network(x),), (network,), x)[0].as_subclass(Tensor).square().sum().backward()
+    assert replays.recorded == 1
+    assert network.weight.grad is not None
+    assert network.weight.grad.stride() == network.weight.stride()
+
+
+def test_no_gradient_no_graph_and_not_without_end(replays: Replays, layer: nn.Linear):
     with torch.no_grad():
         for _ in range(EAGER_CALLS + 2):
             call(replays, layer)
-    assert recorded == []
+    assert replays.recorded == 0
     for rows in range(1, MOST_GRAPHS + 5):
         for _ in range(EAGER_CALLS + 1):
             call(replays, layer, rows)
-    assert len(recorded) == MOST_GRAPHS
+    assert replays.recorded == MOST_GRAPHS
 
 
-def test_a_graph_that_gives_other_numbers_is_not_used(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
-    monkeypatch.setattr(torch.cuda, "make_graphed_callables", recorder(lambda output: output * 1.2)[0])
-    replays = Replays()
-    replays.switch(True)
+def test_photos_of_all_proportions_come_in_fewer_shapes_than_graphs():
+    """For the default's frozen encoder; a network that learns on some steps only has every shape twice."""
+    parsing = Parsing(WildGSConfig().parsing).to("meta")
+    shapes = set()
+    for long_side in (480, 1000, 1600):
+        for short_side in range(120, long_side + 1, 4):
+            photo = torch.empty(short_side, long_side, 3, device="meta")
+            shapes |= {tuple(parsing.shrink(p).shape[2:]) for p in (photo, photo.transpose(0, 1))}
+    assert parsing.encoder.frozen
+    triplane = 1
+    assert len(shapes) == 13
+    assert len(shapes) + triplane <= MOST_GRAPHS == 24
+
+
+def test_a_graph_that_gives_other_numbers_is_not_used(
+    replays: Replays, monkeypatch: pytest.MonkeyPatch, layer: nn.Linear
+):
+    replay = Recording.replay_forward
+    monkeypatch.setattr(Recording, "replay_forward", lambda *args: tuple(1.2 * y for y in replay(*args)))
     for _ in range(EAGER_CALLS):
         wanted = call(replays, layer)
     with pytest.warns(WildGSWarning, match="a replay gives other numbers.*goes on without"):
@@ -98,32 +192,48 @@ def test_a_graph_that_gives_other_numbers_is_not_used(monkeypatch: pytest.Monkey
     assert not replays.on
 
 
-def test_where_recording_fails_training_goes_on(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
-    def fails(*_, **__):
+def test_where_recording_fails_training_goes_on(
+    replays: Replays, monkeypatch: pytest.MonkeyPatch, layer: nn.Linear
+):
+    """On the stream on which it was: a capture that fails leaves its own the current one."""
+
+    @contextmanager
+    def fails(*_: Any, **__: Any):
+        yield
         raise RuntimeError("operation not permitted when stream is capturing\nand more")
 
-    monkeypatch.setattr(torch.cuda, "make_graphed_callables", fails)
-    replays = Replays()
-    replays.switch(True)
+    monkeypatch.setattr(torch.cuda, "Stream", lambda: "another")
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: "training's")
+    monkeypatch.setattr(torch.cuda, "graph", fails)
+    entered = []
+
+    class Stream:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def __enter__(self) -> None:
+            entered.append(self.name)
+
+        def __exit__(self, *_: object) -> None:
+            entered.append(f"out of {self.name}")
+
+    monkeypatch.setattr(torch.cuda, "stream", Stream)
     for _ in range(EAGER_CALLS):
         call(replays, layer)
     with pytest.warns(WildGSWarning, match="operation not permitted when stream is capturing\\)"):
         call(replays, layer).sum().backward()
+    assert entered == ["another", "out of another", "training's", "out of training's"]
     assert layer.weight.grad is not None
     call(replays, layer)
 
 
-def test_a_copy_has_nothing_recorded(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
-    record, recorded = recorder()
-    monkeypatch.setattr(torch.cuda, "make_graphed_callables", record)
-    replays = Replays()
-    replays.switch(True)
+def test_a_copy_has_nothing_recorded(replays: Replays, layer: nn.Linear):
     for _ in range(EAGER_CALLS + 1):
         call(replays, layer)
     twin = copy.deepcopy(replays)
     assert twin.on
     call(twin, layer)
-    assert len(recorded) == 1
+    assert (replays.recorded, twin.recorded) == (1, 0)
 
 
 class Noisy(nn.Module):
@@ -150,21 +260,3 @@ def test_a_small_gradient_that_varies_does_not_reject_a_recording(
         wanted[1][-1].mul_(change)
     found = replays_module._values_and_gradients(network, x, learnt)
     assert all(map(replays_module._alike, wanted, found)) is accepted
-
-
-def test_streams_are_overridden_while_recording_alone(monkeypatch: pytest.MonkeyPatch, layer: nn.Linear):
-    said: list[object] = []
-    monkeypatch.setattr(torch.autograd.graph, "set_override_stale_capture_stream", said.append, raising=False)
-    record, recorded = recorder()
-
-    def records(*arguments, **keywords):
-        said.append("record")
-        return record(*arguments, **keywords)
-
-    monkeypatch.setattr(torch.cuda, "make_graphed_callables", records)
-    replays = Replays()
-    replays.switch(True)
-    for _ in range(EAGER_CALLS + 2):
-        call(replays, layer)
-    assert said == [True, "record", False]
-    assert len(recorded) == 1

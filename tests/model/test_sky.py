@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -100,3 +101,12 @@ def test_the_landmark_keeps_its_colour_under_any_sky(tower: tuple[WildGS, Camera
     torch.testing.assert_close(first.colors[5:35, 20:40], second.colors[5:35, 20:40], atol=0.04, rtol=0)
     assert torch.equal(first.depth, second.depth)
     assert torch.equal(first.alpha, second.alpha)
+
+
+def test_the_sky_does_not_grow_unless_configured(tower: tuple[WildGS, Camera]) -> None:
+    model, _ = tower
+    growable = model.growable()
+    assert growable is not None
+    assert torch.equal(growable, torch.arange(len(growable)) < 1800)
+    model.config = replace(model.config, sky=replace(model.config.sky, densify=True))
+    assert model.growable() is None

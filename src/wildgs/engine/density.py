@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from wildgs.engine.config import DensityConfig
@@ -14,6 +14,7 @@ from wildgs.engine.optimizers import edit_rows, reset_moments
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Projection
+from wildgs.scene.scene import upload
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6
@@ -78,7 +79,10 @@ class DensityControl:
 
     @torch.no_grad()
     def gather(
-        self, projection: Projection, pool: Callable[[ScreenStatistics], ScreenStatistics] | None = None
+        self,
+        projection: Projection,
+        pool: Callable[[ScreenStatistics], ScreenStatistics] | None = None,
+        sound: Bool[Tensor, ""] | None = None,
     ) -> None:
         """Adds one view's screen gradients and reaches; call after the backward pass.
 
@@ -86,8 +90,9 @@ class DensityControl:
             projection: Of that view.
             pool: Makes one view's statistics those of several processes' views, at once: then what this holds
                 is the whole of it in any of them.
+            sound: False where the view is not to count, see `measure`.
         """
-        statistics = self.measure(projection)
+        statistics = self.measure(projection, sound)
         if pool is not None:
             statistics = pool(statistics)
         self.gradient_sum = self.gradient_sum + statistics.gradient_sum
@@ -96,8 +101,13 @@ class DensityControl:
 
     @staticmethod
     @torch.no_grad()
-    def measure(projection: Projection) -> ScreenStatistics:
-        """One view's screen gradients and reaches; zeros where no gradient reached the screen."""
+    def measure(projection: Projection, sound: Bool[Tensor, ""] | None = None) -> ScreenStatistics:
+        """One view's screen gradients and reaches; zeros where no gradient reached the screen.
+
+        Args:
+            projection: Of the view.
+            sound: False where the step was skipped, so that all is zero; None stands for True.
+        """
         gradient = projection.means2d.grad
         if gradient is None:
             zeros = torch.zeros_like(projection.means2d[:, 0])
@@ -105,10 +115,11 @@ class DensityControl:
         camera = projection.camera
         x, y = gradient.unbind(1)
         norm = torch.hypot(x * (camera.width / 2), y * (camera.height / 2))
+        visible = projection.visible if sound is None else projection.visible & sound
         return ScreenStatistics(
-            gradient_sum=torch.where(projection.visible, norm, 0.0),
-            seen=projection.visible.to(norm),
-            reach=(projection.radii / max(camera.width, camera.height)).to(norm),
+            gradient_sum=torch.where(visible, norm, 0.0),
+            seen=visible.to(norm),
+            reach=torch.where(visible, projection.radii / max(camera.width, camera.height), 0.0),
         )
 
     @torch.no_grad()
@@ -119,6 +130,8 @@ class DensityControl:
         generator: torch.Generator,
         *,
         prune_large: bool,
+        growable: Bool[Tensor, "N"] | None = None,
+        sort: bool = False,
     ) -> DensityReport:
         """One round: clones and splits where the screen gradient is large, prunes the faint.
 
@@ -127,10 +140,12 @@ class DensityControl:
             optimizer: Edited alike.
             generator: Draws the split positions.
             prune_large: Whether oversized Gaussians go as well.
+            growable: Which Gaussians may be cloned and split; None for all.
+            sort: Whether to leave the Gaussians in Morton order.
         """
         scales = gaussians.scales
         largest = scales.max(dim=-1).values
-        grows = self._select_growing()
+        grows = self._select_growing(growable)
         clones = grows & (largest <= self.config.split_scale * self.extent)
         splits = grows & ~clones
         prune = gaussians.opacities < self.config.prune_opacity
@@ -139,15 +154,17 @@ class DensityControl:
         finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)
         prune = prune | ~finite
         clones, splits = clones & ~prune, splits & ~prune
-        added = self._cloned(gaussians, clones)
-        halves = self._split(gaussians, splits, generator)
-        added = {name: torch.cat([rows, halves[name]]) for name, rows in added.items()}
         keep = ~(splits | prune)
-        if not keep.any() and not splits.any():
+        cloned, split, pruned, kept = torch.stack([m.sum() for m in (clones, splits, prune, keep)]).tolist()
+        if not kept and not split:
             return DensityReport(0, 0, 0)
-        edit_rows(gaussians, optimizer, keep, added)
+        if cloned or split or pruned:
+            added = self._cloned(gaussians, clones.nonzero()[:, 0])
+            halves = self._split(gaussians, splits.nonzero()[:, 0], generator)
+            added = {name: torch.cat([rows, halves[name]]) for name, rows in added.items()}
+            edit_rows(gaussians, optimizer, keep, added, sort=sort)
         self._clear(len(gaussians))
-        return DensityReport(int(clones.sum()), int(splits.sum()), int(prune.sum()))
+        return DensityReport(cloned, split, pruned)
 
     def _select_large(self, gaussians: Gaussians, largest: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
         """Gaussians that are too large in the scene or on some photo."""
@@ -160,8 +177,10 @@ class DensityControl:
             large = large | (self.reach > self.config.prune_reach)
         return large
 
-    def _select_growing(self) -> Bool[Tensor, "N"]:
+    def _select_growing(self, growable: Bool[Tensor, "N"] | None) -> Bool[Tensor, "N"]:
         mean = self.gradient_sum / self.seen.clamp_min(1)
+        if growable is not None:
+            mean = mean * growable
         grows = mean > self.config.grow_gradient
         room = self.config.max_gaussians - len(mean)
         if int(grows.sum()) > room:
@@ -171,19 +190,19 @@ class DensityControl:
         return grows
 
     @staticmethod
-    def _cloned(gaussians: Gaussians, which: Bool[Tensor, "N"]) -> dict[str, Tensor]:
+    def _cloned(gaussians: Gaussians, which: Int[Tensor, " C"]) -> dict[str, Tensor]:
         return {name: rows.detach()[which] for name, rows in gaussians.rows.items()}
 
     @staticmethod
     def _split(
-        gaussians: Gaussians, which: Bool[Tensor, "N"], generator: torch.Generator
+        gaussians: Gaussians, which: Int[Tensor, " C"], generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Two smaller Gaussians drawn from each large one's own distribution."""
         rows = {
             name: values.detach()[which].repeat(SPLIT_INTO, *[1] * (values.dim() - 1))
             for name, values in gaussians.rows.items()
         }
-        noise = torch.randn(len(rows["means"]), 3, generator=generator).to(rows["means"])
+        noise = upload(torch.randn(len(rows["means"]), 3, generator=generator), rows["means"].device)
         offsets = noise * rows["log_scales"].exp()
         rows["means"] = rows["means"] + torch.einsum("nij,nj->ni", quats_to_rotations(rows["quats"]), offsets)
         rows["log_scales"] = rows["log_scales"] - torch.tensor(SPLIT_SHRINK).log()

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from wildgs import features
 from wildgs.engine.config import OptimizerConfig
 from wildgs.engine.schedule import exponential
 from wildgs.geometry.morton import morton_order
@@ -88,10 +89,15 @@ class Optimizers:
                 chosen = rates[group["name"]]
                 group["lr"] = chosen.start * (self.rate * exponential(1.0, chosen.decay, progress))
 
-    def step(self) -> None:
-        """One Adam step everywhere, then clears the gradients."""
+    def step(self, faulty: Float[Tensor, ""] | None = None) -> None:
+        """One Adam step everywhere, then clears the gradients.
+
+        Args:
+            faulty: Not 0 where the step is not to be taken; read on its device, so that the host need not wait.
+        """
         for optimizer in (self.rows, self.networks):
             if optimizer is not None:
+                optimizer.found_inf = faulty  # pyright: ignore[reportAttributeAccessIssue]
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
 
@@ -134,22 +140,45 @@ def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
 
 @torch.no_grad()
 def edit_rows(
-    gaussians: Gaussians, optimizer: torch.optim.Optimizer, keep: Bool[Tensor, "N"], added: dict[str, Tensor]
+    gaussians: Gaussians,
+    optimizer: torch.optim.Optimizer,
+    keep: Bool[Tensor, "N"],
+    added: dict[str, Tensor],
+    *,
+    sort: bool = False,
 ) -> None:
-    """Drops and appends Gaussians, in parameters and optimiser state alike.
+    """Drops and adds Gaussians, in parameters and optimiser state alike.
 
     Args:
         gaussians: Edited in place.
         optimizer: Holds one group a row, named after it.
         keep: Which present Gaussians stay, in their order.
         added: New Gaussians' rows, one tensor for every row name; they start with empty Adam moments.
+        sort: Whether to put all of them in Morton order, see `sort_rows`; else the new ones come last.
     """
+    kept = keep.nonzero()[:, 0]
+    count, new = len(kept), len(added["means"])
+    source = torch.cat([kept, kept.new_zeros(new)])
+    places = torch.arange(count, count + new, device=keep.device)
+    drawn = None
+    once = sort and features.is_on("densify_once")
+    if once:
+        order = morton_order(torch.cat([gaussians.means[kept], added["means"]]))
+        source = source[order]
+        places = (order >= count).nonzero()[:, 0]
+        drawn = order[places] - count
 
     def edited(name: str, values: Tensor, moments: bool) -> Tensor:
-        new = added[name].to(values)
-        return torch.cat([values[keep], torch.zeros_like(new) if moments else new])
+        rows = values.index_select(0, source)
+        if moments:
+            return rows.index_fill_(0, places, 0.0)
+        return rows.index_copy_(
+            0, places, added[name].to(values) if drawn is None else added[name].to(values)[drawn]
+        )
 
     _change_rows(gaussians, optimizer, edited)
+    if sort and not once:
+        sort_rows(gaussians, optimizer)
 
 
 @torch.no_grad()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import sys
 from contextlib import ExitStack
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,9 +42,6 @@ class ProcessSettings:
             torch.set_flush_denormal(True)
             _keep_freed_memory(True)
             undo.callback(_keep_freed_memory, False)
-        else:
-            _warn_of_stream_mismatch(False)
-            undo.callback(_warn_of_stream_mismatch, True)
         self._undo = undo
 
     def end(self) -> None:
@@ -94,10 +90,3 @@ def _keep_freed_memory(keep: bool) -> None:
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _MMAP_BYTES if keep else _DEFAULT_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES if keep else _DEFAULT_BYTES)
-
-
-def _warn_of_stream_mismatch(warn: bool) -> None:
-    """Torch's warning about gradients that come from another stream, as those of replayed graphs do."""
-    setting: Any = getattr(torch.autograd.graph, "set_warn_on_accumulate_grad_stream_mismatch", None)
-    if setting is not None:
-        setting(warn)

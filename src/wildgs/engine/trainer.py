@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wildgs import features
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.density import DensityControl, DensityReport
 from wildgs.engine.feed import PhotoFeed
@@ -23,7 +24,7 @@ from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
 from wildgs.model.feature_cache import FeatureCache
-from wildgs.model.method import Method, TrainingOutput
+from wildgs.model.method import Method, SeenPhoto, TrainingOutput
 from wildgs.model.parsing import keep_features
 from wildgs.model.precision import (
     choose_precision,
@@ -55,7 +56,8 @@ class StepReport:
         visibility: The mask M, detached; None for a method without one.
         num_gaussians: N after the step.
         density: What densification did, where it ran.
-        skipped: Why the step was skipped, where its loss or gradient was non-finite.
+        skipped: Why the step was skipped, where its loss or gradient was not finite; on a GPU, why the step before
+            was.
         taken: Steps that this one counts for: photos of all processes.
         seconds: Training time so far, without the time that observers take.
     """
@@ -85,6 +87,7 @@ class Trainer:
     Attributes:
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         feature_cache: Bytes for the features that a frozen encoder gave of training photos.
+        skips_on_device: Whether steps that are not finite are skipped without waiting for the device.
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
@@ -122,6 +125,7 @@ class Trainer:
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
         self.guard = StepGuard()
+        self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
         self.cuda_graphs = True
         self.feature_cache = FEATURE_CACHE_BYTES
@@ -136,6 +140,9 @@ class Trainer:
             self.begin()
             while self.step < self.config.steps:
                 report = self.advance()
+                if self.step >= self.config.steps:
+                    self._settle()
+                    self._finish()
                 for observer in observers:
                     observer(report)
         finally:
@@ -171,17 +178,10 @@ class Trainer:
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
+        skipped = self._settle()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
-        fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
-        if fault is None:
-            if self.schedule.gathers(self.step):
-                self.density.gather(output.projection, self.team.pool)
-            self.optimizers.step()
-        else:
-            self.method.zero_grad(set_to_none=True)
-            with self.team.together():
-                self.guard.report(self.step + 1, fault, self.method)
+        skipped = self._take(output, losses) or skipped
         before = self.step
         self.step = min(before + self.team.size, self.config.steps)
         taken = self.step - before
@@ -196,9 +196,38 @@ class Trainer:
             num_gaussians=len(self.method.gaussians),
             density=density,
             seconds=self.seconds,
-            skipped=fault,
+            skipped=skipped,
             taken=taken,
         )
+
+    def _take(self, output: TrainingOutput, losses: Losses) -> str | None:
+        """Lets the optimisers take the step unless it is not finite; why it was skipped, where that is known."""
+        gathers = self.schedule.gathers(self.step)
+        if self.skips_on_device:
+            faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
+            if gathers:
+                self.density.gather(output.projection, self.team.pool, faulty == 0)
+            self.optimizers.step(faulty)
+            return None
+        fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
+        if fault is None:
+            if gathers:
+                self.density.gather(output.projection, self.team.pool)
+            self.optimizers.step()
+        else:
+            self.method.zero_grad(set_to_none=True)
+            with self.team.together():
+                self.guard.report(self.step + 1, fault, self.method)
+        return fault
+
+    def _settle(self) -> str | None:
+        """Reports the step before where it was skipped by the GPU, which has finished it by now; why it was."""
+        found = self.guard.settle()
+        if found is None:
+            return None
+        with self.team.together():
+            self.guard.report(*found, self.method)
+        return found[1]
 
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view)
@@ -229,16 +258,24 @@ class Trainer:
         if self.schedule.densifies(self.step, taken):
             large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(
-                self.method.gaussians, self.optimizers.rows, self.generator, prune_large=large
+                self.method.gaussians,
+                self.optimizers.rows,
+                self.generator,
+                prune_large=large,
+                growable=self.method.growable(),
+                sort=True,
             )
-            if report.cloned or report.split or report.pruned:
-                sort_rows(self.method.gaussians, self.optimizers.rows)
         return report
 
     def shrink_to_budget(self) -> int:
         """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
         budget = self.config.density.max_gaussians
-        return self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+        excess = self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
+        if excess:
+            self.method.finish((), 0)
+            if self.step >= self.config.steps:
+                self._finish()
+        return excess
 
     def _prepare(self) -> None:
         """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
@@ -246,6 +283,18 @@ class Trainer:
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
+
+    def _finish(self) -> None:
+        """Shows the method the training photos once more."""
+        start = time.perf_counter()
+        switch_replays(self.method, False)
+        readable = [view for view in self.views if self.feed.is_readable(view)]
+        self.method.finish(map(self._seen, readable), len(readable))
+        self.seconds += time.perf_counter() - start
+
+    def _seen(self, view: View) -> SeenPhoto:
+        photo, keep = self.feed.photo(view)
+        return SeenPhoto(photo, self.feed.camera(view), keep, view.name)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to go on exactly, as flat tensors."""
@@ -272,6 +321,8 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
+        if self.step < self.config.steps:
+            self.method.finish((), 0)
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -79,6 +79,8 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
         "color_map": torch.zeros(3, 4) if color_map is None else color_map.detach().cpu().contiguous(),
         "global_embedding": embeddings.global_embedding.detach().cpu().float().contiguous(),
     }
+    if embeddings.basis_weights is not None:
+        tensors["basis_weights"] = embeddings.basis_weights.detach().cpu().contiguous()
     if embeddings.local_embeddings is None:
         return tensors
     local = embeddings.local_embeddings.detach().cpu()
@@ -104,10 +106,14 @@ def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
         raise ValueError("embeddings of another length")
     if color_map.shape not in ((3, 4), (3, 4 + SKY_COLUMNS)):
         raise ValueError("a colour map of another shape")
+    weights = tensors.get("basis_weights")
+    if weights is not None and weights.shape != (method.basis_size,):
+        raise ValueError("basis weights of another length")
     local = _local_embeddings(method, tensors) if method.local_size else None
-    if not all(bool(values.isfinite().all()) for values in (common, color_map, local) if values is not None):
+    parts = (common, local, color_map, weights)
+    if not all(bool(values.isfinite().all()) for values in parts if values is not None):
         raise ValueError("embeddings that are not finite")
-    return Embeddings(common.to(device), None if local is None else local.to(device), color_map.to(device))
+    return Embeddings(*(None if values is None else values.float().to(device) for values in parts))  # type: ignore[arg-type]
 
 
 def _local_embeddings(method: Method, tensors: Mapping[str, Tensor]) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,20 +27,25 @@ class Losses:
         total: ``L^I + λ^M L^M + λ^D L^D``, to be differentiated.
     """
 
+    NAMES: ClassVar[tuple[str, ...]] = ("image", "mask", "depth", "total")
+
     image: Float[Tensor, ""]
     mask: Float[Tensor, ""]
     depth: Float[Tensor, ""]
     total: Float[Tensor, ""]
 
+    def terms(self) -> dict[str, Float[Tensor, ""]]:
+        """The four by name, without the autograd graph."""
+        return {name: getattr(self, name).detach() for name in self.NAMES}
+
     def detached(self) -> Losses:
         """The same values without the autograd graph."""
-        return Losses(self.image.detach(), self.mask.detach(), self.depth.detach(), self.total.detach())
+        return Losses(**self.terms())
 
     def as_floats(self) -> dict[str, float]:
         """The four numbers for a log."""
-        names = ("image", "mask", "depth", "total")
-        values = torch.stack([getattr(self, name).detach() for name in names]).tolist()
-        return dict(zip(names, values, strict=True))
+        terms = self.terms()
+        return dict(zip(terms, torch.stack([*terms.values()]).tolist(), strict=True))
 
 
 def total_loss(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -41,11 +43,15 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> Float[Tensor, 
     """
     if x.device.type == "cpu":
         return _CpuSSIM.apply(x, y)
-    if x.dtype == torch.float32 and features.has_triton("triton_ssim"):
-        from wildgs.losses.ssim_triton import TritonSSIM
-
-        return TritonSSIM.apply(x, y)
+    if x.dtype == torch.float32 and features.has_triton("triton_ssim", lambda: _triton(x[:1, :1], y[:1, :1])):
+        return _triton(x, y)
     return _ConvolutionSSIM.apply(x, y)
+
+
+def _triton(x: Tensor, y: Tensor) -> Tensor:
+    from wildgs.losses.ssim_triton import TritonSSIM
+
+    return TritonSSIM.apply(x, y)
 
 
 class _CpuSSIM(torch.autograd.Function):
@@ -145,10 +151,21 @@ def _filter(maps: Float[Tensor, "M C H W"]) -> Float[Tensor, "M C H W"]:
     Never in TF32: with ten bits of mantissa E[x^2] - E[x]^2 cancels (an SSIM of 0.932 became 0.901).
     """
     taps = gaussian_taps(maps.dtype, maps.device)
-    allowed = torch.backends.cudnn.allow_tf32
-    torch.backends.cudnn.allow_tf32 = False
-    try:
+    with _full_precision():
         rows = F.conv2d(maps.flatten(0, 1)[:, None], taps.view(1, 1, -1, 1), padding=(RADIUS, 0))
         return F.conv2d(rows, taps.view(1, 1, 1, -1), padding=(0, RADIUS)).view(maps.shape)
+
+
+@contextmanager
+def _full_precision() -> Iterator[None]:
+    """Convolutions without TF32; where torch has the newer setting for it, it refuses to read the older one."""
+    cudnn: Any = torch.backends.cudnn
+    place, name, value = (
+        (cudnn.conv, "fp32_precision", "ieee") if hasattr(cudnn, "conv") else (cudnn, "allow_tf32", False)
+    )
+    before = getattr(place, name)
+    setattr(place, name, value)
+    try:
+        yield
     finally:
-        torch.backends.cudnn.allow_tf32 = allowed
+        setattr(place, name, before)

@@ -124,6 +124,7 @@ class AffineGS(Method):
         self.sh_degree = config.sh_degree
         self.global_size = config.photo_size
         self.register_buffer("photo_keys", photo_keys)
+        self._places: dict[int, int] | None = None
         self.photo_embeddings = nn.Parameter(torch.zeros(len(photo_keys), config.photo_size))
         self.from_photo = nn.Linear(config.photo_size, config.hidden)
         self.from_gaussian = nn.Linear(config.gaussian_size + 3, config.hidden, bias=False)
@@ -199,8 +200,12 @@ class AffineGS(Method):
 
     def _learnt(self, name: str | None) -> Float[Tensor, " G"] | None:
         """The embedding of a training photo; None for any other."""
-        found = (self.photo_keys == _key(name)).nonzero()[:, 0] if name is not None else []
-        return self.photo_embeddings[found[0]] if len(found) else None
+        if name is None:
+            return None
+        if self._places is None:  # read once: every step would wait for a GPU to say where its photo is
+            self._places = {key: place for place, key in enumerate(self.photo_keys.tolist())}
+        place = self._places.get(_key(name))
+        return None if place is None else self.photo_embeddings[place]
 
     def _mean(self) -> Float[Tensor, " G"]:
         """The mean embedding of the training photos."""

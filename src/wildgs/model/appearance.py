@@ -19,12 +19,14 @@ class Appearance:
         planes: Triplane feature maps F^T, or None: then every Gaussian's local embedding is the vector v.
         visibility: M of the encoded photo (1 = static), or None for a method without a mask.
         color_map: What the embedding missed of the photo's colours (`wildgs.model.color_match`), or None.
+        basis_weights: What both missed of its light, along `wildgs.model.light_basis`, or None.
     """
 
     global_embedding: Float[Tensor, " G"] | None = None
     planes: Float[Tensor, "3 C R R"] | None = None
     visibility: Float[Tensor, "H W"] | None = None
     color_map: Float[Tensor, "3 M"] | None = None
+    basis_weights: Float[Tensor, " B"] | None = None
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,13 @@ class Embeddings:
         local_embeddings: Emb^l per Gaussian; None for a method without local appearance.
         color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none. Where the sky is
             matched apart, its own change follows (`wildgs.model.color_match.match_sky`).
+        basis_weights: Weights of the components of `wildgs.model.light_basis`; None for none.
     """
 
     global_embedding: Float[Tensor, " G"]
     local_embeddings: Float[Tensor, "N L"] | None = None
     color_map: Float[Tensor, "3 M"] | None = None
+    basis_weights: Float[Tensor, " B"] | None = None
 
 
 def blend_embeddings(
@@ -48,7 +52,7 @@ def blend_embeddings(
 ) -> Embeddings:
     """Tuning: Σ w_k f_k on global and local embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
 
-    Colour maps are of the photo as a whole and mix as global embeddings do.
+    Colour maps and basis weights are of the photo as a whole and mix as global embeddings do.
 
     Args:
         parts: Embeddings for the same Gaussians, at least one.
@@ -60,34 +64,36 @@ def blend_embeddings(
     return Embeddings(
         _weighted([part.global_embedding for part in parts], weights),
         _weighted(local, local_weights) if local else None,
-        _mixed_maps(parts, weights),
+        _mixed([part.color_map for part in parts], weights),
+        _mixed([part.basis_weights for part in parts], weights),
     )
 
 
 def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
     """The mean of `count` embeddings, of which one at a time is in memory.
 
-    Of colour maps it is the mean over the parts that have one.
+    Of colour maps and basis weights it is the mean over the parts that have them.
     """
-    total_global, maps, local_mean = [], [], None
+    total_global, maps, basis, local_mean = [], [], [], None
     for part in parts:
         total_global.append(part.global_embedding)
         if part.color_map is not None:
             maps.append(part.color_map)
+        if part.basis_weights is not None:
+            basis.append(part.basis_weights)
         if part.local_embeddings is not None:
             local = part.local_embeddings / count
             local_mean = local if local_mean is None else local_mean.add_(local)
-    color_map = torch.stack(maps).mean(dim=0) if maps else None
-    return Embeddings(torch.stack(total_global).mean(dim=0), local_mean, color_map)
+    color_map, weights = (torch.stack(found).mean(dim=0) if found else None for found in (maps, basis))
+    return Embeddings(torch.stack(total_global).mean(dim=0), local_mean, color_map, weights)
 
 
-def _mixed_maps(parts: Sequence[Embeddings], weights: Sequence[float]) -> Float[Tensor, "3 M"] | None:
-    """Σ w [A | b], where a part without a map changes nothing."""
-    present = [part.color_map for part in parts if part.color_map is not None]
+def _mixed(values: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor | None:
+    """Σ w x, where a part without a value changes nothing."""
+    present = [value for value in values if value is not None]
     if not present:
         return None
-    nothing = torch.zeros_like(present[0])
-    return _weighted([nothing if part.color_map is None else part.color_map for part in parts], weights)
+    return _weighted([torch.zeros_like(present[0]) if x is None else x for x in values], weights)
 
 
 def _weighted(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:

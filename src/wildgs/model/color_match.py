@@ -8,18 +8,23 @@ colours is found in closed form, from one render, and brings most of what many s
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.model.lifting import MIN_ALPHA, liftable
+from wildgs.model.sky import Sky
+from wildgs.rasterize import Rendering
 
-ROUNDS = 6
+ROUNDS, TRAINING_ROUNDS = 6, 3
+"""Of reweighting."""
 RIDGE = 3e-4
 """Of the least squares, in units of mean squared colour: what a photo does not tell stays as it was."""
 OUTLIER = 0.05
 """Residual at which a pixel counts half (Cauchy's weights): passers-by that the mask has missed."""
 LEAST_PIXELS = 64
 """Fewer say nothing about a photo's light."""
+MATCH_EVERY = 3
 
 
 ELEVATION_ORDERS = 2
@@ -53,7 +58,10 @@ def mapped(
 
 @torch.no_grad()
 def match_colors(
-    render: Float[Tensor, "H W 3"], photo: Float[Tensor, "H W 3"], weights: Float[Tensor, "H W"]
+    render: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "H W 3"],
+    weights: Float[Tensor, "H W"],
+    rounds: int = ROUNDS,
 ) -> Float[Tensor, "3 4"]:
     """The affine map of colours that takes a render to its photo, by robust least squares.
 
@@ -61,11 +69,83 @@ def match_colors(
         render: In 0..1, more where the scene is brighter than white.
         photo: In 0..1.
         weights: Of the pixels, 0 or more; 0 where something stands in the way.
+        rounds: Of reweighting.
 
     Returns:
         Change [A | b]: colours c become ``c + A c + b``. Zero where too little of the scene is seen.
     """
-    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None])
+    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None], rounds)
+
+
+@torch.no_grad()
+def match_photo(
+    photo: Float[Tensor, "H W 3"],
+    rendering: Rendering,
+    visibility: Float[Tensor, "H W"] | None,
+    keep: Bool[Tensor, "H W"] | None,
+    *,
+    threshold: float,
+    sky: Sky | None,
+    training: bool = False,
+) -> Float[Tensor, "3 M"]:
+    """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
+
+    Photos are full of sky: one change for all would do to the landmark what the sky needs.
+
+    Args:
+        photo: In 0..1.
+        rendering: From the photo's camera.
+        visibility: M; of the sky, all pixels that are covered count.
+        keep: The user's own mask: pixels that are False do not count.
+        threshold: Th: pixels with a visibility above it are static.
+        sky: Which pixels show it; None matches all pixels alike.
+        training: Reads every third row and column, in fewer rounds.
+
+    Returns:
+        As `match_colors`; with a sky, that of `match_sky` beside it.
+    """
+    static = liftable(visibility, rendering.alpha, threshold)
+    covered = rendering.alpha > MIN_ALPHA
+    if keep is not None:
+        static, covered = static & keep, covered & keep
+    weights = static.float() if visibility is None else visibility * static
+    some = (slice(MATCH_EVERY // 2, None, MATCH_EVERY) if training else slice(None),) * 2
+    rounds = TRAINING_ROUNDS if training else ROUNDS
+    colors, photo, weights = rendering.colors[some], photo[some], weights[some]
+    if sky is None:
+        return match_colors(colors, photo, weights, rounds)
+    own = match_colors(colors, photo, weights * ~sky.which[some], rounds)
+    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], rounds)
+    return torch.cat([own, of_sky], dim=1)
+
+
+def changed_harmonics(
+    harmonics: Float[Tensor, "V K 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+) -> Float[Tensor, "V K 3"]:
+    """The harmonics of changed colours.
+
+    Args:
+        harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
+        change: From `match_photo`.
+        sky: Which Gaussians stand for it; None as in `match_photo`.
+    """
+    if sky is None:
+        return mapped(harmonics, change)
+    own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+    above = mapped(harmonics, of_sky, elevation_powers(sky.sine) @ by_elevation.T)
+    return torch.where(sky.which[:, None, None], above, mapped(harmonics, own))
+
+
+def changed_picture(
+    render: Float[Tensor, "H W 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+) -> Float[Tensor, "H W 3"]:
+    """A render of changed colours, pixel by pixel; see `changed_harmonics`."""
+    own = render + render @ change[:, :3].T + change[:, 3]
+    if sky is None:
+        return own
+    _, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+    above = render + render @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
+    return torch.where(sky.which[..., None], above, own)
 
 
 @torch.no_grad()
@@ -74,6 +154,7 @@ def match_sky(
     photo: Float[Tensor, "H W 3"],
     weights: Float[Tensor, "H W"],
     sine: Float[Tensor, "H W"],
+    rounds: int = ROUNDS,
 ) -> Float[Tensor, "3 M"]:
     """As `match_colors`, for the sky: the change may vary smoothly with the elevation.
 
@@ -82,31 +163,34 @@ def match_sky(
         photo: In 0..1.
         weights: Of the pixels; 0 where there is no sky.
         sine: Of the elevation at which a pixel shows the sky.
+        rounds: Of reweighting.
 
     Returns:
         Change [A | b | E]: colours c become ``c + A c + b + E @ elevation_powers(sine)``.
     """
     further = torch.cat([torch.ones_like(sine)[..., None], elevation_powers(sine)], dim=-1)
-    return _fitted(render, photo, weights, further)
+    return _fitted(render, photo, weights, further, rounds)
 
 
-def _fitted(render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"]) -> Tensor:
-    """Robust least squares of the photo's difference from the render by the render's colours and further terms."""
-    columns = 3 + further.shape[-1]
-    nothing = torch.zeros(3, columns, device=render.device)
-    chosen = weights > 0
-    if int(chosen.sum()) < LEAST_PIXELS:
-        return nothing
-    colors = render[chosen].clamp(0, 1).double()
-    residual = photo[chosen].double() - colors
-    terms = torch.cat([colors, further[chosen].double()], dim=1)
-    base = weights[chosen].double()
+def _fitted(
+    render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"], rounds: int
+) -> Tensor:
+    """Robust least squares of the photo's difference from the render by the render's colours and further terms.
+
+    Nothing in it waits for a GPU: pixels that do not count are weighted, not selected.
+    """
+    counts = (weights > 0).reshape(-1, 1)
+    base = torch.where(counts, weights.reshape(-1, 1), 0).double()
+    colors = torch.where(counts, render.reshape(-1, 3).clamp(0, 1), 0).double()
+    residual = torch.where(counts, photo.reshape(-1, 3), 0).double() - colors
+    terms = torch.cat([colors, further.reshape(len(colors), -1).double()], dim=1)
+    columns = terms.shape[1]
     ridge = RIDGE * torch.eye(columns, dtype=terms.dtype, device=terms.device)
-    change = torch.zeros(columns, 3, dtype=terms.dtype, device=terms.device)
-    trusted = base
-    for _ in range(ROUNDS):
-        weighted = terms * (trusted / trusted.sum())[:, None]
-        change = torch.linalg.solve(weighted.T @ terms + ridge, weighted.T @ residual)
-        error = (residual - terms @ change).abs().mean(dim=1)
+    change, trusted = terms.new_zeros(columns, 3), base
+    for _ in range(rounds):
+        weighted = terms * (trusted / trusted.sum())
+        change = torch.linalg.solve_ex(weighted.T @ terms + ridge, weighted.T @ residual).result
+        error = (residual - terms @ change).abs().mean(dim=1, keepdim=True)
         trusted = base * OUTLIER**2 / (OUTLIER**2 + error.square())
-    return change.T.float().contiguous() if change.isfinite().all() else nothing
+    usable = change.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
+    return torch.where(usable, change.T.float(), 0).contiguous()

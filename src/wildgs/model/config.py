@@ -133,6 +133,8 @@ class SkyConfig:
         lowest: Elevation at which the shell ends, degrees. Below the horizon it closes the scene behind ground that
             too few photos show: such holes are as dark as the background otherwise.
         opacity: Of its Gaussians at the start.
+        densify: Whether its Gaussians are cloned and split as others are: clouds, which no two photos share, then
+            take up to half of the budget.
     """
 
     points: int = 5000
@@ -140,6 +142,7 @@ class SkyConfig:
     reach: float = 2.0
     lowest: float = -90.0
     opacity: float = 0.5
+    densify: bool = False
 
 
 @dataclass(frozen=True)
@@ -208,6 +211,10 @@ class WildGSConfig:
         sky: Gaussians that stand for the sky at the start.
         color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
             scene's colours under that are from the photo's. Not in the paper.
+        matched_loss: How much of the colour match a training render gets before it is compared with its photo, from
+            0 to 1. Not in the paper.
+        light_components: Size of the basis of lights in which a photo's light is fitted after the colour match
+            (`wildgs.model.light_basis`); 0 for none. Not in the paper.
         learning_rates: Of networks and intrinsic features.
     """
 
@@ -220,6 +227,8 @@ class WildGSConfig:
     ground: GroundConfig = field(default_factory=GroundConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
+    matched_loss: float = 1.0
+    light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
 

@@ -93,6 +93,23 @@ class MemoryUse:
     fixed: int
 
 
+@dataclass(frozen=True)
+class SeenPhoto:
+    """A training photo, as `Method.finish` gets it.
+
+    Attributes:
+        photo: RGB in [0, 1].
+        camera: Its camera, of the photo's size.
+        keep: The user's own mask: pixels that are False are not read.
+        name: The photo's.
+    """
+
+    photo: Float[Tensor, "H W 3"]
+    camera: Camera
+    keep: Bool[Tensor, "H W"] | None
+    name: str
+
+
 class Method(nn.Module, ABC):
     """A set of Gaussians and a way to colour them.
 
@@ -124,6 +141,11 @@ class Method(nn.Module, ABC):
     local_size: int = 0
     mask_threshold: float = 0.5
     depth_supervised: bool = False
+
+    @property
+    def basis_size(self) -> int:
+        """Number of basis weights of an appearance; 0 for a method that fits none."""
+        return 0
 
     # What a method declares.
 
@@ -185,10 +207,22 @@ class Method(nn.Module, ABC):
         """N."""
         return len(self.gaussians)
 
+    def growable(self) -> Bool[Tensor, " N"] | None:
+        """Which Gaussians densification may clone and split; None for all."""
+        return None
+
     # Encode, shade, render.
 
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
         """Looks at some training photos (RGB in [0, 1]) once, before the first step."""
+
+    def finish(self, photos: Iterable[SeenPhoto], count: int) -> None:
+        """Looks at the training photos once more, after the last step.
+
+        Args:
+            photos: Read one at a time; none where training continues: what was learnt from them is forgotten.
+            count: How many there are.
+        """
 
     @abstractmethod
     def encode(

@@ -7,15 +7,44 @@ cameras. Others have done the same: Kulhanek et al. 2024 (WildGaussians) place p
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.model.config import SkyConfig
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 COLOR = 0.75
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What is sky among points of the scene.
+
+    Attributes:
+        which: Which points are.
+        sine: Of every point's elevation, seen from the scene's centre.
+    """
+
+    which: Bool[Tensor, "*batch"]
+    sine: Float[Tensor, "*batch"]
+
+
+def find_sky(config: SkyConfig, points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]) -> Sky | None:
+    """Tells the sky from the scene: it is further away than half of the shell's radius.
+
+    Args:
+        config: The shell; without points there is no sky.
+        points: In the aligned frame.
+        centre: Of the scene.
+    """
+    if not config.points:
+        return None
+    offsets = points - centre
+    distances = offsets.norm(dim=-1)
+    return Sky(distances > 0.5 * config.radius, offsets[..., 2] / distances.clamp_min(1e-6))
 
 
 def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor, "S 3"]:

@@ -140,16 +140,24 @@ def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]
     """
     if planes.device.type == "cpu" and planes.dtype == torch.float32:
         return _SampleOnCPU.apply(planes, points)
-    if planes.is_cuda and planes.dtype == torch.float32 and features.has_triton("triton_planes"):
-        from wildgs.model.triplane_triton import TritonSample
-
-        return TritonSample.apply(planes, points)
+    if planes.is_cuda and planes.dtype == torch.float32 and _has_triton(planes, points):
+        return _triton(planes, points)
     x, y, z = points.detach().unbind(1)  # no index lists: each would be carried to a GPU, which is waited for
     grid = torch.stack([x, y, y, z, z, x], dim=1).reshape(-1, 3, 2).permute(1, 0, 2)
     sampled = functional.grid_sample(
         planes, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False
     )
     return sampled.sum(dim=0)[:, 0].T
+
+
+def _has_triton(planes: Tensor, points: Tensor) -> bool:
+    return features.has_triton("triton_planes", lambda: _triton(planes[..., :1, :1], points.new_zeros(1, 3)))
+
+
+def _triton(planes: Tensor, points: Tensor) -> Tensor:
+    from wildgs.model.triplane_triton import TritonSample
+
+    return TritonSample.apply(planes, points)
 
 
 class _SampleOnCPU(torch.autograd.Function):

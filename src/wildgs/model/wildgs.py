@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -12,26 +12,29 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import elevation_powers, mapped, match_colors, match_sky
+from wildgs.model.color_match import changed_harmonics, changed_picture, match_photo
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.lifting import MIN_ALPHA, lift, liftable, random_part
+from wildgs.model.lifting import lift, liftable, random_part
+from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import (
     GEOMETRY_ROWS,
     MemoryUse,
     Method,
     ParameterGroup,
+    SeenPhoto,
     Stage,
     TrainingOutput,
 )
 from wildgs.model.parsing import Parsing
 from wildgs.model.rows import paint_visible, take_rows
+from wildgs.model.sky import Sky, find_sky
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping
-from wildgs.rasterize import Projection, blend
+from wildgs.rasterize import Projection, Rendering, blend
 
 
 class WildGS(Method):
@@ -65,6 +68,7 @@ class WildGS(Method):
         self.parsing = Parsing(config.parsing, encoder)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
+        self.light_basis = LightBasis()
 
     @classmethod
     def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
@@ -99,9 +103,15 @@ class WildGS(Method):
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
         """With a fresh encoder and any box."""
-        return cls(
-            config, gaussians, Box(torch.zeros(3), torch.ones(3)), encoder_of(state, "parsing.encoder.")
-        )
+        box = Box(torch.zeros(3), torch.ones(3))
+        model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
+        model.light_basis.components = state.get("light_basis.components")
+        return model
+
+    def growable(self) -> Bool[Tensor, " N"] | None:
+        """All but the sky, unless configured."""
+        sky = None if self.config.sky.densify else self._find_sky(self.gaussians.means)
+        return None if sky is None else ~sky.which
 
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
@@ -120,8 +130,13 @@ class WildGS(Method):
         ]
 
     def appearance_parameters(self) -> tuple[str, ...]:
-        """The centres, at which planes are sampled, and the fusion network."""
-        return ("fusion.", "gaussians.rows.means")
+        """The centres, at which planes are sampled, the fusion network and the basis of lights."""
+        return ("fusion.", "gaussians.rows.means", "light_basis.")
+
+    @property
+    def basis_size(self) -> int:
+        """Components of the basis of lights."""
+        return 0 if self.light_basis.components is None else len(self.light_basis.components)
 
     def _lacks(self, part: Ablation) -> bool:
         return part in self.config.without
@@ -129,6 +144,21 @@ class WildGS(Method):
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
         """Gives a fresh encoder its normalisation statistics."""
         self.parsing.calibrate(photos)
+
+    @torch.no_grad()
+    def finish(self, photos: Iterable[SeenPhoto], count: int) -> None:
+        """Learns the basis of lights."""
+        self.light_basis.components = None
+        if not self.config.color_match:
+            return
+        most = self.light_basis.affordable_lights(self.num_gaussians, (self.sh_degree + 1) ** 2)
+        chosen = {number * count // most for number in range(most)} if count > most else set(range(count))
+        lights = (
+            self.shade(self.encode(seen.photo, seen.camera, seen.keep, name=seen.name))
+            for number, seen in enumerate(photos)
+            if number in chosen
+        )
+        self.light_basis.learn(lights, self.gaussians, self.config.light_components)
 
     def encode(
         self,
@@ -153,6 +183,7 @@ class WildGS(Method):
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
         if self.config.color_match and trust_mask:
             appearance = self._match(photo, appearance, projection, keep)
+            appearance = self.light_basis.fit(self, photo, appearance, camera, keep)
         return appearance
 
     @torch.no_grad()
@@ -163,39 +194,16 @@ class WildGS(Method):
         projection: Projection,
         keep: Bool[Tensor, "H W"] | None,
     ) -> Appearance:
-        """Adds what the appearance's own render of the photo is off by, for the landmark and the sky apart.
+        """Adds what the appearance's own render of the photo is off by."""
+        rendering = blend(projection, paint_visible(self, projection, appearance, self.sh_degree))
+        sky = self._find_sky(projection.camera.unproject(rendering.depth))
+        change = match_photo(
+            photo, rendering, appearance.visibility, keep, threshold=self.mask_threshold, sky=sky
+        )
+        return replace(appearance, color_map=change)
 
-        Photos are full of sky: one change for all would do to the landmark what the sky needs.
-        """
-        colors = paint_visible(self, projection, appearance, self.sh_degree)
-        rendering = blend(projection, colors)
-        static = liftable(appearance.visibility, rendering.alpha, self.mask_threshold)
-        if keep is not None:
-            static = static & keep
-        weights = static.float() if appearance.visibility is None else appearance.visibility * static
-        if not self.config.sky.points:
-            return replace(appearance, color_map=match_colors(rendering.colors, photo, weights))
-        sky = rendering.depth > self._sky_distance
-        covered = (rendering.alpha > MIN_ALPHA) & sky
-        if keep is not None:
-            covered = covered & keep
-        _, sine = self._seen_from_centre(projection.camera.unproject(rendering.depth))
-        own = match_colors(rendering.colors, photo, weights * ~sky)
-        of_sky = match_sky(rendering.colors, photo, covered.float(), sine)
-        return replace(appearance, color_map=torch.cat([own, of_sky], dim=1))
-
-    @property
-    def _sky_distance(self) -> float:
-        """Half of the shell's radius: what is further away, as a Gaussian or a rendered depth, counts as sky."""
-        return 0.5 * self.config.sky.radius
-
-    def _seen_from_centre(
-        self, points: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Distances of points from the centre of the triplane, and sines of their elevations."""
-        offsets = points - (self.wrapping.low + self.wrapping.high) / 2
-        distances = offsets.norm(dim=-1)
-        return distances, offsets[..., 2] / distances.clamp_min(1e-6)
+    def _find_sky(self, points: Float[Tensor, "*batch 3"]) -> Sky | None:
+        return find_sky(self.config.sky, points.detach(), (self.wrapping.low + self.wrapping.high) / 2)
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
         """M, by 2D Parsing alone."""
@@ -255,10 +263,17 @@ class WildGS(Method):
         means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
-        return Embeddings(appearance.global_embedding, local, appearance.color_map)
+        return Embeddings(appearance.global_embedding, local, appearance.color_map, appearance.basis_weights)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Fuses to spherical harmonics: sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
+        harmonics = self._fused(embeddings, rows)
+        if embeddings.basis_weights is None:
+            return harmonics
+        return harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
+
+    def _fused(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None) -> Float[Tensor, "N K 3"]:
+        """What the networks and the colour match make of embeddings."""
         intrinsic = self.gaussians.rows["intrinsic"]
         if rows is not None:
             intrinsic = take_rows(intrinsic, rows)
@@ -271,12 +286,9 @@ class WildGS(Method):
         )
         if change is None or change.shape[1] == 4:
             return self.fusion(common, local, intrinsic, change)
-        harmonics = self.fusion(common, local, intrinsic)
-        own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
-        means = self.gaussians.means.detach()
-        distance, sine = self._seen_from_centre(means if rows is None else means[rows])
-        sky = mapped(harmonics, of_sky, elevation_powers(sine) @ by_elevation.T)
-        return torch.where((distance > self._sky_distance)[:, None, None], sky, mapped(harmonics, own))
+        means = self.gaussians.means
+        sky = self._find_sky(means if rows is None else means[rows])
+        return changed_harmonics(self.fusion(common, local, intrinsic), change, sky)
 
     def training_pass(
         self,
@@ -296,4 +308,23 @@ class WildGS(Method):
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = paint_visible(self, projection, appearance, stage.sh_degree)
-        return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
+        rendering = blend(projection, colors)
+        if self.config.color_match and self.config.matched_loss:
+            rendering = self._matched(photo, rendering, appearance.visibility, camera, keep)
+        return TrainingOutput(rendering, projection, appearance.visibility)
+
+    def _matched(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        rendering: Rendering,
+        visibility: Float[Tensor, "H W"] | None,
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None,
+    ) -> Rendering:
+        """The render as `encode`'s colour match would leave it; no gradient reaches the match itself."""
+        with torch.no_grad():
+            sky = self._find_sky(camera.unproject(rendering.depth))
+            change = self.config.matched_loss * match_photo(
+                photo, rendering, visibility, keep, threshold=self.mask_threshold, sky=sky, training=True
+            )
+        return replace(rendering, colors=changed_picture(rendering.colors, change, sky))
