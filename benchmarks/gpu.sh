@@ -52,7 +52,7 @@ train_sizes=()
 if [ -n "$dry" ]; then
   export CUDA_VISIBLE_DEVICES=
   tiny=(--tiny) step_sizes=(--width 48 --n 200 --steps 1) render_sizes=(--backends cpu --n 200 --sizes 32x24)
-  train_sizes=(--wrapping.resolution 8 --parsing.max-side 32 --parsing.encoder none/none --log-every 1)
+  train_sizes=(--wrapping.resolution 8 --parsing.max-side 64 --max-gaussians 300 --log-every 1)
 elif [ -z "${TORCH_CUDA_ARCH_LIST:-}" ]; then
   # For this GPU alone: gsplat's kernels take minutes for each architecture.
   TORCH_CUDA_ARCH_LIST=$("$python" -c '

@@ -53,7 +53,7 @@ class Size:
 
 
 FULL = Size(480, (1_000_000, 100_000), 60, 200, 10)
-TINY = Size(48, (300, 200), 4, 6, 2)
+TINY = Size(48, (300, 200), 2, 4, 1)
 
 
 def say(**values: Any) -> None:

@@ -33,6 +33,17 @@ def test_changes_what_it_names_and_nothing_else():
         ({"train.steps.more": 1}, "steps is a value"),
         ({"method": "nerf"}, "config.method"),
         ({"data.downscale": 0}, "downscale"),
+        ({"data.downscale": 1e12}, "downscale"),
+        ({"model.mask_threshold": float("nan")}, "mask_threshold"),
+        ({"model.mask_threshold": -1}, "mask_threshold -1.0: must be from 0 to 1"),
+        ({"model.sky.points": -1}, "model.sky.points -1: must be from 0"),
+        ({"model.sky.lowest": 1e12}, "model.sky.lowest"),
+        ({"model.fusion.hidden": 10**9}, "model.fusion.hidden 1000000000"),
+        ({"method": "affine", "model.photo_size": 10**9}, "model.photo_size"),
+        ({"method": "affine", "model.initial.sky.points": -1}, "model.initial.sky.points"),
+        ({"train.optimizer.means": 0}, "train.optimizer.means 0"),
+        ({"train.objective.depth_weight": float("inf")}, "depth_weight inf"),
+        ({"model.learning_rates.networks": -1}, "networks -1"),
     ],
 )
 def test_what_does_not_exist_or_fit_is_named(entries, said):

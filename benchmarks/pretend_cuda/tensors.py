@@ -24,7 +24,9 @@ FREE = frozenset((
     "lift_fresh", "diagonal", "unfold", "resize_", "_local_scalar_dense",
 ))  # fmt: skip
 """Operations that launch nothing."""
-COUNTING = frozenset(("nonzero", "masked_select", "repeat_interleave", "_unique2", "equal", "is_nonzero"))
+COUNTING = frozenset((
+    "nonzero", "masked_select", "repeat_interleave", "_unique2", "equal", "is_nonzero", "_linalg_check_errors",
+))  # fmt: skip
 """Operations after which the host waits: for the size of the result, or for the result."""
 CARRYING = frozenset(("_to_copy", "copy_", "_copy_from", "_foreach_copy_"))
 """Operations that take tensors of several devices."""

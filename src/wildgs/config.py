@@ -16,7 +16,7 @@ import yaml.composer
 
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
-from wildgs.files import written_aside
+from wildgs.files import check_regular, written_aside
 from wildgs.model.registry import DEFAULT_METHOD, MethodName, config_type
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
@@ -25,6 +25,35 @@ MAX_CONFIG_BYTES = 1_000_000
 
 _BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
 """First and last line: a file that is cut off would be YAML still, and missing entries take their defaults."""
+_MOST = 1e9
+_RANGES: dict[str, tuple[float, float]] = {
+    "data.downscale": (1, 1000),
+    "data.max_image_pixels": (1, 1e12),
+    "train.seed": (0, 2**63 - 1),
+    "train.objective.weight_l1": (0, 1),
+    "train.optimizer.means": (1e-12, _MOST),
+    "train.density.reset_opacity": (1e-6, 1),
+    "train.density.max_gaussians": (1, _MOST),
+    "model.mask_threshold": (0, 1),
+    "model.parsing.max_side": (16, 4096),
+    "model.parsing.global_size": (1, 1024),
+    "model.fusion.intrinsic_size": (3, 1024),
+    "model.fusion.hidden": (1, 4096),
+    "model.photo_size": (1, 1024),
+    "model.gaussian_size": (1, 1024),
+    "model.hidden": (1, 4096),
+    "model.encode_steps": (0, 1e6),
+    "model.depth_points.cell": (1e-4, 1e3),
+    "model.depth_points.agreement": (0, 1),
+    "model.ground.points": (0, 1e7),
+    "model.ground.spacing": (1e-4, 1e3),
+    "model.sky.points": (0, 1e7),
+    "model.sky.radius": (1e-3, 1e6),
+    "model.sky.reach": (0, 1e6),
+    "model.sky.lowest": (-90, 89),
+    "model.sky.opacity": (1e-6, 0.999999),
+}
+"""Least and greatest value of entries that cannot take every number from 0 to `_MOST`."""
 _MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
 """Entries of earlier versions' `config.yaml` that belong to `ExecutionConfig` now."""
 
@@ -91,6 +120,10 @@ class RunConfig:
             raise TypeError(
                 f"method {self.method} takes a {kind.__name__}, not a {type(self.model).__name__}"
             )
+        for path, value in _flat(to_plain(self)).items():
+            least, most = _RANGES.get(path.replace("model.initial.", "model."), (0, _MOST))
+            if isinstance(value, int | float) and not least <= value <= most:  # NaN neither
+                raise UserError(f"{path} {value}: must be from {least:g} to {most:g}")
 
     def with_method(self, method: MethodName) -> RunConfig:
         """The same run by another method, with that method's default options."""
@@ -253,6 +286,7 @@ def read_config(path: Path) -> RunConfig:
         UserError: The file is missing, no YAML, or no run configuration.
     """
     try:
+        check_regular(path)
         if path.stat().st_size > MAX_CONFIG_BYTES:
             raise UserError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is no run's configuration")
         text = path.read_text(encoding="utf-8")
@@ -300,6 +334,21 @@ def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[An
     one, other = _flat(to_plain(first)), _flat(to_plain(second))
     paths = dict.fromkeys(path for path in (*one, *other) if path != "scene")
     return {p: (one.get(p), other.get(p)) for p in paths if one.get(p) != other.get(p)}
+
+
+def edited_entries(config: RunConfig, plain: Any) -> str:
+    """Entries in which a configuration is not as a checkpoint's header has it, for a message; empty if none.
+
+    The place of the scene and the bound on Gaussians may differ, and so may entries of other versions.
+
+    Args:
+        config: As `config.yaml` has it now.
+        plain: As `to_plain` gave it when the checkpoint was written.
+    """
+    now, then = _flat(to_plain(config)), _flat(plain)
+    allowed = {"scene", "train.density.max_gaussians"}
+    changed = [path for path in now if path in then and path not in allowed and now[path] != then[path]]
+    return ", ".join(f"{path} was {then[path]}, is {now[path]}" for path in changed[:3])
 
 
 def _flat(plain: Any, path: str = "") -> dict[str, Any]:

@@ -18,6 +18,7 @@ MAX_NAME_BYTES = 255
 _BIDI_CONTROLS = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 
 ASIDE_SUFFIX = ".part"
+FINGERPRINT_BYTES = 65_536
 
 
 @contextmanager
@@ -91,6 +92,29 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):  # a name that is too long, a null character
         return False
+
+
+def is_there(path: Path) -> bool:
+    """Whether a name is taken, be it by a pipe or a link to nothing; False for names that no file system takes."""
+    try:
+        return path.is_symlink() or path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def fingerprint(path: Path) -> str:
+    """A short digest of a file's size, beginning and end; empty where it cannot be read."""
+    try:
+        check_regular(path)
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            digest = hashlib.sha256(str(size).encode())
+            for start in (0, max(0, size - FINGERPRINT_BYTES)):
+                file.seek(start)
+                digest.update(file.read(FINGERPRINT_BYTES))
+    except OSError:
+        return ""
+    return digest.hexdigest()[:16]
 
 
 def check_regular(path: Path) -> None:

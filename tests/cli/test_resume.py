@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from wildgs.config import read_config
+from wildgs.errors import WildGSWarning
 from wildgs.runs import load_run
 
 TRAIN = ("--method", "3dgs", "--steps", 6, "--downscale", 2)
@@ -52,6 +53,17 @@ def test_the_same_command_and_other_execution_go_on(run: Path, landmark: Path, w
     execution = ("--image-cache", "1MB", "--checkpoint-every", 3, "--threads", 1, "--no-cuda-graphs")
     assert wildgs("train", landmark, "--output", run, "--resume", *TRAIN) == 0
     assert wildgs("train", landmark, "--output", run, "--resume", *execution) == 0
+
+
+def test_a_configuration_that_was_edited_is_not_resumed(run: Path, landmark: Path, wildgs, capsys) -> None:
+    """The first steps would be of one configuration and the others of another."""
+    file = run / "config.yaml"
+    file.write_text(file.read_text().replace("steps: 6", "steps: 60"))
+    capsys.readouterr()
+    assert wildgs("train", landmark, "--output", run, "--resume") == 2
+    assert "changed after training began (train.steps was 6, is 60)" in complaint(capsys)
+    with pytest.warns(WildGSWarning, match=r"changed after training \(train\.steps was 6, is 60\)"):
+        load_run(run)
 
 
 def test_the_scene_may_have_moved(run: Path, landmark: Path, tmp_path: Path, wildgs) -> None:

@@ -6,6 +6,7 @@ from PIL import Image
 
 from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
+from wildgs.config import RunConfig, write_config
 from wildgs.library import pipeline
 from wildgs.priors.depth import DepthEstimator
 from wildgs.sfm import reconstruction
@@ -110,7 +111,7 @@ def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
             pipeline.run(output / "scene/images", output)
         assert len(estimated) == 2
     (depth_folder / "p01.png").unlink()
-    (output / "config.yaml").write_text("")
+    write_config(output / "config.yaml", RunConfig(output / "scene"))
     with pytest.raises(KeyboardInterrupt):
         pipeline.run(output / "scene/images", output)
     assert len(estimated) == 2

@@ -12,9 +12,10 @@ from PIL import Image
 import wildgs
 from wildgs.config import write_config
 from wildgs.errors import UserError
-from wildgs.library.collection import compare_collection, record_collection
-from wildgs.library.pipeline import CPU_LONG_SIDE, GPU_LONG_SIDE, _photo_size
+from wildgs.library.collection import changed_options, compare_collection, record_collection
+from wildgs.library.pipeline import CPU_LONG_SIDE, GPU_LONG_SIDE, _configure, _photo_size
 from wildgs.runs import lock_run
+from wildgs.sfm.config import PairingConfig, SfmConfig
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def scene(photos: Path, tmp_path: Path) -> Path:
     """Stands for a scene that was made from them."""
     folder = tmp_path / "run" / "scene"
     (folder / "sparse" / "0").mkdir(parents=True)
-    record_collection(photos, folder)
+    record_collection(photos, folder, SfmConfig(max_features=500))
     return folder
 
 
@@ -89,8 +90,45 @@ def test_every_photo_has_a_limit_of_its_own_unless_the_run_began_otherwise(tmp_p
     assert _photo_size(tmp_path, 300, None).max_side == 300
 
 
+def test_options_that_are_left_out_are_those_of_the_run(tmp_path: Path) -> None:
+    """A bare `wildgs run PHOTOS --output RUN` goes on; what is given again is compared with the run."""
+    file = tmp_path / "config.yaml"
+    data, train = wildgs.DataConfig(downscale=2.0, holdout=4), wildgs.TrainConfig(steps=7)
+    begun = wildgs.RunConfig(tmp_path, data=data, train=train)
+    write_config(file, begun)
+    assert _configure(tmp_path, file, None, _photo_size(tmp_path, None, None), None, None) == begun
+    other = _configure(tmp_path, file, 9, _photo_size(tmp_path, None, 3.0), 50, 0)
+    assert (other.train.steps, other.data.downscale, other.data.holdout) == (9, 3.0, 0)
+    assert other.train.density.max_gaussians == 50
+
+
 def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: Path) -> None:
     Image.fromarray(np.full((8, 8, 3), 200, dtype=np.uint8)).save(photos / "added.jpg")
     with pytest.raises(UserError, match=r"other photos than .*added\.jpg.*--output"):
         wildgs.run(photos, scene.parent)
     assert not (scene.parent / "checkpoints").exists()
+
+
+def test_other_options_than_those_of_the_poses_are_refused(photos: Path, scene: Path) -> None:
+    """They would be dropped without a word; threads decide nothing, and a default may stand for what was given."""
+    asked = SfmConfig(max_features=900, pairing=PairingConfig(neighbours=7), threads=1)
+    with pytest.raises(UserError, match=r"--neighbours was 40, not 7, --max-features was 500, not 900"):
+        wildgs.run(photos, scene.parent, sfm=asked)
+    assert not changed_options(scene, SfmConfig(threads=2))
+
+
+@pytest.mark.parametrize("inside", ["", "run", "more/run"])
+def test_an_output_among_the_photos_is_refused(photos: Path, inside: str) -> None:
+    """Its pictures would be photos of the next run."""
+    for verb in (wildgs.run, wildgs.reconstruct):
+        with pytest.raises(UserError, match="lies in the folder of the photos"):
+            verb(photos, photos / inside)
+    assert len(list(photos.rglob("*"))) == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_record_that_is_no_file_is_refused(photos: Path, scene: Path) -> None:
+    (scene / "collection.json").unlink()
+    os.mkfifo(scene / "collection.json")
+    with pytest.raises(UserError, match="not a regular file"):
+        wildgs.run(photos, scene.parent)

@@ -95,7 +95,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "names": ("used", "", "used"),
         "read-only": _UNWRITTEN,
         "full disk": _UNWRITTEN,
-        "link loop": ("used", "", "as missing"),
+        "link loop": _BAD_MASK,
     },
     "depth": {
         "missing": ("used", "", "used: trains without depth"),
@@ -109,7 +109,7 @@ TABLE: dict[str, dict[str, Cell]] = {
         "names": ("used", "", "used"),
         "read-only": _UNWRITTEN,
         "full disk": _UNWRITTEN,
-        "link loop": ("used", "", "as missing"),
+        "link loop": _BAD_DEPTH,
     },
     "checkpoint": {
         "missing": ("error", "no checkpoint yet", "error; --resume starts at step 0"),

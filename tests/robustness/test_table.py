@@ -185,7 +185,7 @@ def spoil_mask(root: Path, fault: str, model) -> None:
         return
     spoil_picture(root / "masks" / PHOTO, fault, 1)
     if fault == "duplicate":
-        picture(root / "masks" / f"{PHOTO}.png", np.zeros((16, 24), np.uint8))
+        picture(root / "masks" / f"{PHOTO}.png", np.eye(16, 24, dtype=np.uint8))
 
 
 def spoil_depth(root: Path, fault: str, model) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 import wildgs
 from wildgs.config import read_config, with_entries, write_config
@@ -142,6 +143,29 @@ def test_a_changed_scene_changes_no_camera_and_is_said(trained: Path, landmark: 
         assert view.split == before[view.name].split
 
 
+def test_photos_masks_and_depth_that_were_exchanged_are_said(
+    trained: Path, landmark: Path, tmp_path: Path
+) -> None:
+    """The cameras are the same, and so are the names: a score would be of other photos."""
+    changed = tmp_path / "scene"
+    shutil.copytree(landmark, changed)
+    run = load_run(trained, CPU)
+    run.read_scene(changed)
+    first, second, third = sorted((changed / "images").iterdir())[:3]
+    with Image.open(first) as image:
+        image.transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(first)
+    (changed / "masks").mkdir(exist_ok=True)
+    with Image.open(second) as image:
+        Image.linear_gradient("L").resize(image.size).save(changed / "masks" / f"{second.name}.png")
+    (changed / "depth" / f"{third.stem}.png").unlink()
+    said = (
+        rf"1 photo with another content: {first.name}; 1 photo with another mask: {second.name}; "
+        rf"1 photo with another depth prior: {third.name}"
+    )
+    with pytest.warns(WildGSWarning, match=said):
+        run.read_scene(changed)
+
+
 def test_another_scene_is_not_trained_into_a_run(trained: Path, old: Path, make_scene) -> None:
     other = make_scene(9)
     for folder in (trained, old):
@@ -166,8 +190,6 @@ def test_a_look_of_another_run_is_refused(trained: Path) -> None:
 
 
 def test_a_file_that_is_written_again_gives_its_new_light(trained: Path, tmp_path: Path) -> None:
-    from PIL import Image
-
     scene = wildgs.load(trained, CPU)
     like = scene.views[0].name
     file = tmp_path / "cur.jpg"

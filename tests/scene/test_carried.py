@@ -199,8 +199,8 @@ def test_photos_that_differ_by_their_ending_share_nothing(make_scene: MakeScene)
     for name, value in (("a.jpg", 1), ("a.png", 3)):
         Image.fromarray(codes // value).save(root / "depth" / f"{name}.png")
     Image.fromarray(codes).save(root / "depth" / "a.png")
-    black = Image.new("L", (48, 32), 0)
-    black.save(root / "masks" / "a.png")
+    mask = Image.fromarray(np.tri(32, 48, dtype=np.uint8))
+    mask.save(root / "masks" / "a.png")
     first, second, _ = load_scene(root, DataConfig(holdout=0)).views
     assert float(first.read_disparity().max()) == 1  # pyright: ignore[reportOptionalMemberAccess]
     assert float(second.read_disparity().max()) == pytest.approx(1 / 3, abs=1e-4)  # pyright: ignore

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.scene_files import photo
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.undistort import PixelGrid
@@ -203,10 +204,10 @@ def test_masks_depth_and_truth_are_undistorted_with_the_photo(make_scene: MakeSc
 
 def test_masks_go_by_name_or_stem_and_depth_by_stem_in_subfolders(make_scene: MakeScene) -> None:
     root = make_scene(names=["a/x.png", "b/x.png", "c.png"])
-    black = Image.new("L", (W, H), 0)
+    mask = Image.fromarray(np.tri(H, W, dtype=np.uint8))
     (root / "masks/a").mkdir(parents=True)
-    black.save(root / "masks/a/x.png.png")
-    black.save(root / "masks/c.png")
+    mask.save(root / "masks/a/x.png.png")
+    mask.save(root / "masks/c.png")
     (root / "depth/b").mkdir(parents=True)
     Image.fromarray(np.full((H, W), 65535, dtype=np.uint16)).save(root / "depth/b/x.png")
 
@@ -430,21 +431,58 @@ def test_a_mask_may_have_the_photos_own_name(make_scene: MakeScene) -> None:
     root = make_scene(names=["x.jpg", "y.jpg"])
     (root / "masks").mkdir()
     Image.new("L", (W, H), 0).save(root / "masks" / "x.jpg")
-    first, second = load_scene(root, DataConfig(holdout=0)).views
+    with pytest.warns(WildGSWarning, match=r"1 photos are masked completely.*x\.jpg.*0 is what is ignored"):
+        first, second = load_scene(root, DataConfig(holdout=0)).views
     mask = first.read_mask()
     assert mask is not None
     assert not mask.any()
     assert second.read_mask() is None
 
 
-def test_masks_of_no_photo_are_said(make_scene: MakeScene) -> None:
+@pytest.mark.parametrize("folder", ["masks", "depth"])
+def test_files_of_no_photo_are_named(make_scene: MakeScene, folder: str) -> None:
+    """A mask that is not read, for its name alone, would train what it should hide."""
+    root = make_scene(3)
+    (root / folder).mkdir()
+    load_scene(root)
+    picture = Image.linear_gradient("L").resize((W, H))
+    for name in ("p00.png", "p1.png", "p02.PNG", ".hidden.png"):
+        picture.save(root / folder / name)
+    with pytest.warns(WildGSWarning, match=rf"{folder}: 2 files .* not used: p02\.PNG, p1\.png"):
+        load_scene(root)
+    load_scene(root, DataConfig(use_masks=folder != "masks", use_depth=folder != "depth"))
+
+
+def test_masks_of_photos_without_a_pose_are_no_mistake(make_scene: MakeScene) -> None:
     root = make_scene(3)
     (root / "masks").mkdir()
+    Image.fromarray(photo()).save(root / "images" / "unregistered.png")
+    Image.linear_gradient("L").resize((W, H)).save(root / "masks" / "unregistered.png")
     load_scene(root)
-    Image.new("L", (W, H), 0).save(root / "masks" / "other.png")
-    with pytest.warns(WildGSWarning, match=r"none of its files is named after a photo.*p00\.png\.png"):
-        load_scene(root)
-    load_scene(root, DataConfig(use_masks=False))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize("kind", ["pipe", "folder", "link to nothing"])
+def test_what_takes_the_place_of_a_mask_or_depth_is_reported(make_scene: MakeScene, kind: str) -> None:
+    root = make_scene(3)
+    for folder in ("masks", "depth"):
+        path = root / folder / "p01.png"
+        path.parent.mkdir()
+        if kind == "pipe":
+            os.mkfifo(path)
+        elif kind == "folder":
+            path.mkdir()
+        else:
+            path.symlink_to(root / "nowhere")
+    with pytest.raises(UserError, match=r"masks/p01\.png: (not a regular|no such) file; repair the mask"):
+        load_scene(root, DataConfig(use_depth=False))
+    with pytest.warns(WildGSWarning, match=r"depth/p01\.png: .*trains without depth"):
+        load_scene(root, DataConfig(use_masks=False, holdout=0))
+
+
+def test_photos_that_are_shrunk_to_nothing_are_an_error(make_scene: MakeScene) -> None:
+    with pytest.raises(UserError, match=r"pixels are too few; lower --downscale or"):
+        load_scene(make_scene(3), DataConfig(downscale=1000))
 
 
 @pytest.mark.parametrize("target", ["pipe", "/dev/zero"])

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import os
 import signal
@@ -13,7 +14,7 @@ from PIL import Image
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.colmap import read_model
-from wildgs.sfm import reconstruction
+from wildgs.sfm import mapping, reconstruction
 from wildgs.sfm.reconstruction import PairingConfig, SfmConfig, reconstruct
 
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
@@ -223,15 +224,78 @@ def test_a_replacement_that_fails_leaves_the_old_scene(
     assert content(old_scene) == before
 
 
-def test_a_replacement_that_was_killed_is_undone(old_scene: Path, new_scene: Path) -> None:
+@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("step", range(1, 10))
+def test_a_replacement_that_was_killed_is_undone(
+    old_scene: Path, new_scene: Path, monkeypatch: pytest.MonkeyPatch, step: int, again: bool
+) -> None:
+    """Wherever it was; also where the next call, which undoes it, is killed once more."""
+    (new_scene / "masks").mkdir(exist_ok=True)
+    (new_scene / "masks" / "new.png").touch()
     before = content(old_scene)
-    aside = old_scene / ".replaced"
-    aside.mkdir()
-    for name in ("images", "depth"):
-        (old_scene / name).rename(aside / name)
-    (new_scene / "images").rename(old_scene / "images")
+
+    def killed_at(call: int, name: str):
+        original, calls = getattr(Path, name), [0]
+
+        def move(path: Path, target: Path) -> Path:
+            calls[0] += 1
+            if calls[0] == call:
+                raise KeyboardInterrupt
+            return original(path, target)
+
+        return move
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", killed_at(step, "rename"))
+        patch.setattr(reconstruction, "_restore", lambda _: None)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruction._move_in(new_scene, old_scene)
+    if again:
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "replace", killed_at(2, "replace"))
+            with contextlib.suppress(KeyboardInterrupt):
+                reconstruction._restore(old_scene)
     reconstruction._restore(old_scene)
     assert content(old_scene) == before
+
+
+def test_the_faster_of_two_reconstructions_stays(
+    tmp_path: Path, corner: Corner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = save_photos(tmp_path / "p", corner[0][:4])
+    write = reconstruction._write_scene
+
+    def slow(*arguments: object) -> None:
+        write(*arguments)  # pyright: ignore[reportArgumentType]
+        (tmp_path / "out" / "images").mkdir(parents=True)
+        (tmp_path / "out" / reconstruction.REPORT_NAME).touch()
+
+    monkeypatch.setattr(reconstruction, "_write_scene", slow)
+    with pytest.raises(UserError, match="already holds a scene"):
+        reconstruct(photos, tmp_path / "out")
+
+
+@pytest.mark.parametrize("place", ["a file/scene", "full"])
+def test_a_place_that_cannot_be_written_is_one_line(
+    tmp_path: Path, corner: Corner, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    photos = save_photos(tmp_path / "p", corner[0][:2])
+    (tmp_path / "a file").touch()
+    if place == "full":
+
+        def full(*_: object, **__: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("shutil.copyfile", full)
+        monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(UserError, match=r"cannot be written .*choose another --output"):
+        reconstruct(photos, tmp_path / place)
+
+
+def test_options_that_mean_nothing_are_refused() -> None:
+    for name in ("max_features", "max_image_size", "max_image_pixels", "threads"):
+        with pytest.raises(UserError, match=name.replace("_", "-")):
+            SfmConfig(**{name: 0})
 
 
 @pytest.mark.parametrize(
@@ -304,3 +368,18 @@ def test_sacre_coeur_registers_by_retrieval(tmp_path: Path, shared: Path) -> Non
     assert report.pairing == "retrieval"
     assert report.pairs < 45
     assert len(report.registered) >= 9
+
+
+def test_colmap_decodes_no_more_at_once_than_we_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its threads keep whole pictures: four of 240 megapixels took 10 GB."""
+    work = mapping.Workplace(tmp_path)
+    work.images.mkdir()
+    sides = [10, 10, 10, 40, 10, 10]
+    for number, side in enumerate(sides):
+        Image.new("RGB", (side, side)).save(work.images / f"{number}.jpg")
+    monkeypatch.setattr(mapping, "DECODING_PIXELS", 250)
+    names = [f"{number}.jpg" for number in range(6)]
+    assert list(mapping._batches(work, names)) == [names[:2], names[2:3], names[3:4], names[4:]]
+    monkeypatch.setattr(mapping, "DECODING_PIXELS", 10**6)
+    monkeypatch.setattr(mapping, "EXTRACTION_BATCH", 4)
+    assert list(mapping._batches(work, names)) == [names[:4], names[4:]]

@@ -2,6 +2,7 @@ import os
 import struct
 import threading
 import time
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,13 @@ def test_scene_names_are_jpegs_with_stems_of_their_own() -> None:
     stems = [name.rsplit(".", 1)[0].casefold() for name in result]
     assert len(set(stems)) == len(names)
     assert all(name.lower().endswith((".jpg", ".jpeg")) for name in result)
+
+
+def test_names_that_some_systems_take_for_one_are_kept_apart() -> None:
+    """Case, and accents as one letter or two."""
+    names = ["caf\u00e9.jpg", "cafe\u0301.jpg", "A.jpg", "a.jpg", "stra\u00dfe.jpg", "STRASSE.jpg"]
+    folded = {unicodedata.normalize("NFC", name).casefold() for name in scene_names(names)}
+    assert len(folded) == len(names)
 
 
 def test_hidden_files_and_other_files_are_no_photos(tmp_path: Path) -> None:

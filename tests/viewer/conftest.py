@@ -81,7 +81,7 @@ def wall() -> Scene:
 def make_trainer(scene: Scene, steps: int, method="wildgs") -> Trainer:
     model = WildGSConfig(
         sky=SkyConfig(points=0),
-        parsing=ParsingConfig(max_side=32, encoder="nobody/none"),
+        parsing=ParsingConfig(max_side=32),
         wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)),
     )
     torch.manual_seed(0)

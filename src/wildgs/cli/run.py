@@ -20,7 +20,7 @@ class Command:
     """Poses, trains, scores and shows a folder of photos.
 
     Steps and size follow the machine unless given: 30,000 steps on photos of up to 1,600 pixels on a GPU, 3,000
-    steps on photos of up to 400 pixels on a CPU.
+    steps on photos of up to 400 pixels on a CPU. The same command goes on where it was interrupted.
 
     Example: wildgs run photos/sacre_coeur --output runs/sacre_coeur
     """
@@ -37,8 +37,8 @@ class Command:
     """Divides the photos' width and height, before --max-side; without --max-side the only reduction."""
     max_gaussians: int | None = None
     """Upper bound on the number of Gaussians; by default it follows the machine."""
-    holdout: int = 8
-    """Every n-th photo is held out for scoring; 0 = none."""
+    holdout: int | None = None
+    """Every n-th photo is held out for scoring; 0 = none. (default: 8)"""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
     image_cache: str = IMAGE_CACHE
     """Memory for decoded photos; photos beyond it are decoded again when their turn comes."""

@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from wildgs.errors import UserError
-from wildgs.files import written_aside
+from wildgs.files import check_regular, is_there, written_aside
+from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.upright import list_photos, scene_names
 
 FILE = "collection.json"
@@ -62,15 +63,16 @@ def photo_files(folder: Path) -> dict[str, Path]:
     return {name: folder / name for name in list_photos(folder)}
 
 
-def record_collection(photos: Path, scene: Path) -> None:
-    """Writes down, beside a scene, which photos it was made from.
+def record_collection(photos: Path, scene: Path, sfm: SfmConfig) -> None:
+    """Writes down, beside a scene, from which photos and with which options it was made.
 
     Raises:
         UserError: A photo cannot be read, or the disk is full.
     """
     records = {name: asdict(_record(path)) for name, path in photo_files(photos).items()}
+    content = {"sfm": _plain(sfm), "photos": records}
     with written_aside(scene / FILE) as aside:
-        aside.write_text(json.dumps(records, indent=1) + "\n", encoding="utf-8")
+        aside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def compare_collection(photos: Path, scene: Path) -> Changes:
@@ -83,7 +85,7 @@ def compare_collection(photos: Path, scene: Path) -> Changes:
         UserError: There is no such folder, or the record cannot be read.
     """
     present = photo_files(photos)
-    stored = _read(scene / FILE)
+    stored = _read(scene / FILE)[0]
     if stored is None:
         known = set(scene_names(list(present)))
         gone = [name for name in list_photos(scene / "images") if name not in known]
@@ -96,13 +98,36 @@ def compare_collection(photos: Path, scene: Path) -> Changes:
     )
 
 
-def _read(file: Path) -> dict[str, PhotoRecord] | None:
-    if not file.is_file():
-        return None
+def changed_options(scene: Path, sfm: SfmConfig) -> str:
+    """Options that are neither the default nor those that a scene was made with, for a message; empty if none.
+
+    Raises:
+        UserError: The record cannot be read.
+    """
+    stored, defaults = _read(scene / FILE)[1], _plain(SfmConfig())
+    return ", ".join(
+        f"--{name.replace('_', '-')} was {stored[name]}, not {value}"
+        for name, value in _plain(sfm).items()
+        if name in stored and value not in (stored[name], defaults[name])
+    )
+
+
+def _plain(sfm: SfmConfig) -> dict[str, object]:
+    """Options that decide the poses, without nesting."""
+    plain = asdict(sfm)
+    return {name: value for name, value in (plain.pop("pairing") | plain).items() if name != "threads"}
+
+
+def _read(file: Path) -> tuple[dict[str, PhotoRecord] | None, dict[str, object]]:
+    """Photos and options; None and nothing where there is no record."""
+    if not is_there(file):
+        return None, {}
     try:
+        check_regular(file)
         content = json.loads(file.read_text(encoding="utf-8"))
-        return {str(name): PhotoRecord(**record) for name, record in content.items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        records = {str(name): PhotoRecord(**record) for name, record in content["photos"].items()}
+        return records, dict(content["sfm"])
+    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise UserError(f"{file} cannot be read ({error}); delete it, or choose another --output") from error
 
 

@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from wildgs.config import ExecutionConfig, RunConfig, read_config
+from wildgs.config import ExecutionConfig, RunConfig, read_config, with_entries
 from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
-from wildgs.library.collection import compare_collection, photo_files, record_collection
+from wildgs.library.collection import (
+    changed_options,
+    compare_collection,
+    record_collection,
+)
 from wildgs.library.evaluation import Scores, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.showcase import write_showcase
@@ -21,7 +25,7 @@ from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.reconstruction import reconstruct
+from wildgs.sfm.reconstruction import check_photos, reconstruct
 
 CPU_STEPS, GPU_STEPS = 3000, 30_000
 CPU_LONG_SIDE, GPU_LONG_SIDE = 400, 1600
@@ -53,13 +57,15 @@ def run(
     max_side: int | None = None,
     downscale: float | None = None,
     max_gaussians: int | None = None,
-    holdout: int = 8,
+    holdout: int | None = None,
     sfm: SfmConfig | None = None,
     execution: ExecutionConfig | None = None,
     progress: Progress | None = None,
     observers: Sequence[Observer] = (),
 ) -> FinishedRun:
     """Poses, trains, scores and shows a folder of photos; stages that are done already are not done again.
+
+    A training that was interrupted goes on with the options that it began with, where they are None.
 
     Args:
         photos: Folder of photos.
@@ -69,7 +75,7 @@ def run(
             GPU and 400 on a CPU, or no limit where `downscale` is given.
         downscale: Divides the photos' width and height, before `max_side`.
         max_gaussians: Upper bound on the number of Gaussians; by default it follows the machine.
-        holdout: Every n-th photo is held out for scoring; 0 for none.
+        holdout: Every n-th photo is held out for scoring, by default every eighth; 0 for none.
         sfm: Options of structure from motion.
         execution: How it is executed.
         progress: Called during all stages.
@@ -80,14 +86,14 @@ def run(
             works on OUTPUT.
     """
     photos, output, progress = Path(photos), Path(output), progress or silent
-    photo_files(photos)  # a wrong folder is said before anything is written
+    check_photos(photos, output)  # a wrong folder is reported before anything is written
     with lock_run(output):
         scene_folder = output / "scene"
         _pose(photos, scene_folder, sfm, progress)
         if not (output / CONFIG_FILE).is_file():
             _estimate_depth_if_possible(scene_folder, progress)
         size = _photo_size(output, max_side, downscale)
-        config = _configure(scene_folder, steps, replace(size, holdout=holdout), max_gaussians)
+        config = _configure(scene_folder, output / CONFIG_FILE, steps, size, max_gaussians, holdout)
         scene = read_scene(config, execution or ExecutionConfig(), progress)
         train(
             scene,
@@ -117,7 +123,7 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
     """
     if not (scene / "sparse" / "0").is_dir():
         report = reconstruct(photos, scene, sfm, progress=progress)
-        record_collection(photos, scene)
+        record_collection(photos, scene, sfm or SfmConfig())
         for line in report.lines():
             logger.info("%s", line)
         return
@@ -126,6 +132,11 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
         raise UserError(
             f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or "
             f"delete {scene.parent} to start again with these photos"
+        )
+    if options := changed_options(scene, sfm or SfmConfig()):
+        raise UserError(
+            f"{scene} has poses that were made with other options ({options}); leave them out, or choose another "
+            "--output"
         )
     logger.info("%s has poses of these photos already; going on with them", scene)
 
@@ -182,13 +193,29 @@ def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
         fill_depth_folder(scene, estimator, progress=counter(progress, "estimating depth"))
 
 
-def _configure(scene: Path, steps: int | None, data: DataConfig, max_gaussians: int | None) -> RunConfig:
-    """Steps and number of Gaussians that suit the machine."""
-    gpu = default_device().type == "cuda"
-    steps = steps or (GPU_STEPS if gpu else CPU_STEPS)
-    most = max_gaussians or (DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
-    train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=most))
-    return RunConfig(scene.resolve(), data=data, train=train)
+def _configure(
+    scene: Path,
+    file: Path,
+    steps: int | None,
+    size: DataConfig,
+    max_gaussians: int | None,
+    holdout: int | None,
+) -> RunConfig:
+    """The run's own configuration, or one that suits the machine, with the options that were given."""
+    if file.is_file():
+        config = read_config(file)
+    else:
+        gpu = default_device().type == "cuda"
+        density = DensityConfig(max_gaussians=DensityConfig().max_gaussians if gpu else CPU_MAX_GAUSSIANS)
+        config = RunConfig(scene, train=TrainConfig(steps=GPU_STEPS if gpu else CPU_STEPS, density=density))
+    given = {
+        "train.steps": steps,
+        "train.density.max_gaussians": max_gaussians,
+        "data.holdout": holdout,
+    }
+    config = with_entries(config, {name: value for name, value in given.items() if value is not None})
+    data = replace(config.data, downscale=size.downscale, max_side=size.max_side)
+    return replace(config, scene=scene.resolve(), data=data)
 
 
 def _photo_size(output: Path, max_side: int | None, downscale: float | None) -> DataConfig:

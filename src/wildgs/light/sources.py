@@ -179,7 +179,7 @@ def _stamp(file: Path) -> tuple[int, ...]:
     if not is_file(file):
         return ()
     state = file.stat()
-    return state.st_mtime_ns, state.st_size, state.st_ino
+    return state.st_ctime_ns, state.st_mtime_ns, state.st_size, state.st_ino
 
 
 def _silent(*_: object) -> None:

@@ -14,7 +14,7 @@ import filelock
 import torch
 from torch import Tensor
 
-from wildgs.config import RunConfig, read_config, to_plain, write_config
+from wildgs.config import RunConfig, edited_entries, read_config, to_plain, write_config
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
@@ -115,6 +115,13 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
     checkpoint = newest_checkpoint(folder)
     if checkpoint is None:
         raise UserError(f"{folder} has no checkpoint yet; let `wildgs train` finish or resume it")
+    if changes := edited_entries(config, checkpoint.header.get("config")):
+        warnings.warn(
+            f"{folder / CONFIG_FILE} was changed after training ({changes}); what follows is of the changed "
+            "configuration",
+            WildGSWarning,
+            stacklevel=2,
+        )
     method = restore_method(config.method, config.model, checkpoint.method)
     with _complete(folder):
         return Run(
@@ -279,6 +286,7 @@ def resume_training(
     checkpoint = team.from_first(lambda: newest_checkpoint(folder, set_aside=True))
     if checkpoint is None:
         return start_training(folder, config, scene, device, team, progress)
+    team.from_first(lambda: _refuse_edited(folder, config, checkpoint))
     record = team.from_first(lambda: carried_record(folder, scene, progress))
     with team.together(), _complete(folder):
         method = restore_method(config.method, config.model, checkpoint.method)
@@ -286,6 +294,14 @@ def resume_training(
         trainer = Trainer(method.to(device or default_device()), scene, config.train, team)
         trainer.restore(checkpoint.state)
     return trainer
+
+
+def _refuse_edited(folder: Path, config: RunConfig, checkpoint: Checkpoint) -> None:
+    if changes := edited_entries(config, checkpoint.header.get("config")):
+        raise UserError(
+            f"{folder / CONFIG_FILE} was changed after training began ({changes}); put it back as it was, or start "
+            "a new run in another --output"
+        )
 
 
 def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Alignment) -> Path:

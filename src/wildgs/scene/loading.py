@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import is_file
 from wildgs.geometry.camera import Camera
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
@@ -80,7 +79,8 @@ def load_scene(
     chosen = [image for image in model.images if image.name in splits]
     views, broken = _load_views(chosen, splits, photos, alignment, config, lazy, progress)
     _report_broken(broken, views, model.images_dir)
-    _check_masks(photos, views)
+    _report_unused(photos)
+    _report_blank(views, photos)
     return Scene(
         root=root,
         views=tuple(views),
@@ -91,15 +91,25 @@ def load_scene(
     )
 
 
-def _check_masks(photos: ScenePhotos, views: Sequence[View]) -> None:
-    """Warns where there are masks, and none of them belongs to a photo."""
-    folder = photos.root / "masks"
-    if not photos.use_masks or not folder.is_dir() or not any(is_file(file) for file in folder.rglob("*")):
-        return
-    if all(photos.find_mask(view.name) is None for view in views):
+def _report_unused(photos: ScenePhotos) -> None:
+    """Warns of masks and depth priors that are named after no photo."""
+    for folder, used in (("masks", photos.use_masks), ("depth", photos.use_depth)):
+        if used and (names := photos.unused(folder)):
+            warnings.warn(
+                f"{photos.root / folder}: {len(names)} files are named after no photo and are not used: "
+                f"{describe_names(names)}; the file of a.jpg is {'a.jpg.png or ' * (folder == 'masks')}a.png",
+                WildGSWarning,
+                stacklevel=3,
+            )
+
+
+def _report_blank(views: Sequence[View], photos: ScenePhotos) -> None:
+    """Warns of photos that train with no pixel: a mask whose black and white are exchanged."""
+    blank = [view.name for view in views if view.split == "train" and view.name in photos.blank]
+    if blank:
         warnings.warn(
-            f"{folder}: none of its files is named after a photo, so no mask is used; "
-            f"name them as in {views[0].name}.png",
+            f"{len(blank)} photos are masked completely, so nothing is learned from them: "
+            f"{describe_names(blank)}; in masks, 0 is what is ignored",
             WildGSWarning,
             stacklevel=3,
         )
@@ -163,7 +173,12 @@ def _pixel_grid(image: ColmapImage, config: DataConfig) -> PixelGrid:
         raise UnreadableImageError(
             f"its camera has {size[0]}x{size[1]} pixels, more than --max-image-pixels {config.max_image_pixels}"
         )
-    return PixelGrid.from_colmap(image.camera, config.downscale, config.max_side)
+    grid = PixelGrid.from_colmap(image.camera, config.downscale, config.max_side)
+    if min(grid.width, grid.height) < 2:
+        raise UnreadableImageError(
+            f"{grid.width}x{grid.height} pixels are too few; lower --downscale or raise --max-side"
+        )
+    return grid
 
 
 def _report_broken(broken: Sequence[tuple[str, str]], views: Sequence[View], images_dir: Path) -> None:

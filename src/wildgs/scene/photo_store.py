@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import is_file
+from wildgs.files import fingerprint, is_there
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.image_cache import ImageCache
 from wildgs.scene.images import (
@@ -75,6 +75,10 @@ class PhotoStore(ABC):
             UserError: It cannot be read.
         """
 
+    def fingerprint(self, name: str) -> dict[str, str]:
+        """What tells a photo's files from others, by what they are; empty where there are no files."""
+        return {}
+
     def prefetch(self, name: str) -> None:  # noqa: B027 - stores that need no preparation do nothing
         """Says that a photo's turn comes soon, so that it can be decoded in the background."""
 
@@ -123,7 +127,11 @@ class MemoryPhotos(PhotoStore):
 
 
 class ScenePhotos(PhotoStore):
-    """The photos of a scene folder with their masks and depth priors, decoded within a memory limit."""
+    """The photos of a scene folder with their masks and depth priors, decoded within a memory limit.
+
+    Attributes:
+        blank: Photos whose every pixel is masked, of those that `load` has read.
+    """
 
     def __init__(
         self,
@@ -157,6 +165,7 @@ class ScenePhotos(PhotoStore):
         self._depth = depth_files(root, names)
         self._shared = _shared_stems(names)
         self._without_depth: set[str] = set()
+        self.blank: set[str] = set()
 
     def add(self, name: str, grid: PixelGrid) -> None:
         """Makes a photo known.
@@ -178,7 +187,10 @@ class ScenePhotos(PhotoStore):
             UnreadableImageError: The photo itself cannot be decoded.
             UserError: The photo has another shape than its camera, or its mask cannot be used.
         """
-        self.cache.put(name, self._decode(name), keep=keep)
+        photo = self._decode(name)
+        if photo.mask is not None and not photo.mask.any():
+            self.blank.add(name)
+        self.cache.put(name, photo, keep=keep)
 
     def get(self, name: str) -> Photo:
         """See `PhotoStore.get`."""
@@ -188,6 +200,15 @@ class ScenePhotos(PhotoStore):
             raise UserError(
                 f"{self.images_dir / name}: {error}; put the photo back, or replace it"
             ) from error
+
+    def fingerprint(self, name: str) -> dict[str, str]:
+        """See `PhotoStore.fingerprint`: of photo, mask and depth prior, so far as they are used."""
+        files = {
+            "content": self.images_dir / name,
+            "mask": self.find_mask(name) if self.use_masks else None,
+            "depth prior": self._depth[name] if self.use_depth else None,
+        }
+        return {what: digest for what, file in files.items() if file and (digest := fingerprint(file))}
 
     def prefetch(self, name: str) -> None:
         """See `PhotoStore.prefetch`."""
@@ -218,7 +239,24 @@ class ScenePhotos(PhotoStore):
         return self._find("masks", *candidates)
 
     def _find(self, folder: str, *names: str) -> Path | None:
-        return next((path for name in names if is_file(path := self.root / folder / name)), None)
+        """The first that is there; what is no regular file is found too, so that reading it says so."""
+        return next((path for name in names if is_there(path := self.root / folder / name)), None)
+
+    def unused(self, folder: str) -> list[str]:
+        """Files in `masks/` or `depth/` that belong to no photo of the scene's folder, by names relative to it."""
+        files = [path for path in (self.root / folder).rglob("*") if not path.is_dir()]
+        if not files:
+            return []
+        names = {path.relative_to(self.images_dir).as_posix() for path in self.images_dir.rglob("*")}
+        known = {path.relative_to(self.root / "depth").as_posix() for path in self._depth.values()}
+        for name in names | set(self._depth):
+            known |= {name, f"{name}.png", with_ending(name, ".png")}
+        return sorted(
+            name
+            for path in files
+            if (name := path.relative_to(self.root / folder).as_posix()) not in known
+            and not any(part.startswith(".") for part in PurePosixPath(name).parts)
+        )
 
     def _read_mask(self, path: Path, grid: PixelGrid) -> UInt8[np.ndarray, "H W"]:
         try:
@@ -258,7 +296,7 @@ class ScenePhotos(PhotoStore):
     def _read_disparity(self, name: str, grid: PixelGrid) -> UInt16[np.ndarray, "H W"] | None:
         """The depth prior; one that is missing or broken is not looked for, and warned of, again."""
         path = self._depth[name]
-        if not self.use_depth or name in self._without_depth or not is_file(path):
+        if not self.use_depth or name in self._without_depth or not is_there(path):
             self._without_depth.add(name)
             return None
         try:

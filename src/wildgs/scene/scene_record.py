@@ -44,6 +44,8 @@ class SceneRecord:
         point_colors: Their colours.
         observations: Rows of photos and of the points that they triangulated.
         alignment: From the model's frame to the aligned one.
+        contents: Fingerprints of the files of each photo (`PhotoStore.fingerprint`); empty in records of earlier
+            versions.
     """
 
     names: tuple[str, ...]
@@ -55,6 +57,7 @@ class SceneRecord:
     point_colors: UInt8[Tensor, "P 3"]
     observations: Int[Tensor, "T 2"]
     alignment: Alignment
+    contents: tuple[dict[str, str], ...] = ()
 
     @classmethod
     def of(cls, scene: Scene) -> SceneRecord:
@@ -70,6 +73,7 @@ class SceneRecord:
             point_colors=scene.point_colors,
             observations=scene.observations,
             alignment=scene.alignment,
+            contents=tuple(view.photos.fingerprint(view.name) for view in scene.views),
         )
 
     def write(self, file: Path) -> None:
@@ -80,6 +84,7 @@ class SceneRecord:
         """
         tensors = {field: getattr(self, field).contiguous() for field in _FIELDS}
         header = {"format": FORMAT, "names": self.names, "alignment": self.alignment.to_dict()}
+        header["contents"] = self.contents
         with written_aside(file, flush=True) as aside:
             try:
                 save_file(tensors, aside, metadata={"wildgs": json.dumps(header)})
@@ -103,6 +108,7 @@ class SceneRecord:
             record = cls(
                 names=tuple(str(name) for name in header["names"]),
                 alignment=Alignment.from_dict(header["alignment"]),
+                contents=tuple(dict(entry) for entry in header.get("contents", ())),
                 **tensors,
             )
             record._check()
@@ -119,6 +125,8 @@ class SceneRecord:
             ValueError: They do not.
         """
         views, points = len(self.names), len(self.points)
+        if len(self.contents) not in (0, views):
+            raise ValueError("its fingerprints are not one for each photo")
         shapes: Mapping[str, Sequence[int]] = {
             "viewmats": (views, 4, 4),
             "K": (views, 3, 3),
@@ -177,6 +185,7 @@ class SceneRecord:
         differences += _describe("with another size or focal length", changed)
         resplit = [view.name for view in kept if view.split != now[view.name].split]
         differences += _describe("in another split (the run's own is used)", resplit)
+        differences += self._other_files(now)
         if not self._same_points(found):
             differences.append("other sparse points (the run's own are used)")
         views = tuple(
@@ -206,6 +215,16 @@ class SceneRecord:
             return camera
         double = replace(camera, viewmat=camera.viewmat.double())
         return self.alignment.apply_camera(alignment.inverse().apply_camera(double))
+
+    def _other_files(self, now: Mapping[str, View]) -> list[str]:
+        """What differs in the files of photos, in words; a photo that cannot be read differs in nothing."""
+        found: dict[str, list[str]] = {}
+        for name, then in zip(self.names, self.contents, strict=False):
+            files = now[name].photos.fingerprint(name) if name in now and then else then
+            for what in ("content", "mask", "depth prior"):
+                if files.get(what) != then.get(what):
+                    found.setdefault(what, []).append(name)
+        return [line for what, names in found.items() for line in _describe(f"with another {what}", names)]
 
     def _same_points(self, found: Scene) -> bool:
         if found.points.shape != self.points.shape:

@@ -47,7 +47,7 @@ def read_split(path: Path) -> dict[str, Split]:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise UserError(f"{path}: larger than {MAX_FILE_BYTES} bytes; this is not a split file")
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, delimiter="\t"))
+            rows = list(csv.DictReader(file, delimiter="\t", strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path}: the split file cannot be read ({error})") from error
     columns = set(rows[0]) if rows else set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from wildgs.errors import UserError
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 
 
@@ -37,3 +38,10 @@ class SfmConfig:
     """CPU threads; -1 = all."""
     seed: int = 0
     """Random seed of matching and mapping."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_image_size", "max_features", "max_image_pixels"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name.replace('_', '-')} {getattr(self, name)}: must be 1 or more")
+        if self.threads != -1 and self.threads < 1:
+            raise UserError(f"threads {self.threads}: must be 1 or more, or -1 for all")

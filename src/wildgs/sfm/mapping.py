@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 import pycolmap
 
 from wildgs.errors import UserError
+from wildgs.scene.images import DECODING_PIXELS, open_image
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.pairs import Pairing, choose_pairs
 from wildgs.sfm.upright import WorkingCopy
@@ -75,9 +77,8 @@ def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, p
         if masked:
             reader.mask_path = work.masks
         names = [copy.work_name for copy in copies if copy.masked == masked]
-        for start in range(0, len(names), EXTRACTION_BATCH):
+        for batch in _batches(work, names):
             progress("finding features", done, len(copies))
-            batch = names[start : start + EXTRACTION_BATCH]
             pycolmap.extract_features(
                 work.database,
                 work.images,
@@ -88,6 +89,22 @@ def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, p
             )
             done += len(batch)
     progress("finding features", done, len(copies))
+
+
+def _batches(work: Workplace, names: Sequence[str]) -> Iterator[list[str]]:
+    """Copies that COLMAP may decode at the same time: its threads keep whole pictures."""
+    batch: list[str] = []
+    pixels = 0
+    for name in names:
+        with open_image(work.images / name, sys.maxsize) as image:
+            own = image.width * image.height
+        if batch and (len(batch) == EXTRACTION_BATCH or pixels + own > DECODING_PIXELS):
+            yield batch
+            batch, pixels = [], 0
+        batch.append(name)
+        pixels += own
+    if batch:
+        yield batch
 
 
 def match(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> Pairing:

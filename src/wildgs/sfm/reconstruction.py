@@ -6,8 +6,8 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -35,8 +35,9 @@ from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
 
 SCENE_PARTS = ("images", "sparse", "masks", REPORT_NAME)
-ASIDE, DONE = ".replaced", ".done"
-"""Folder of the old scene while the new one takes its place, and the file in it that says that it has."""
+ASIDE, MOVED, DONE = ".replaced", ".moved", ".done"
+"""Folder of the old scene while the new one takes its place, and the files in it that say that the old scene is
+complete there, and that the new one is in its place."""
 
 __all__ = ["PairingConfig", "Progress", "SfmConfig", "SfmReport", "reconstruct"]
 
@@ -74,6 +75,14 @@ def reconstruct(
     config, progress = config or SfmConfig(), progress or (lambda stage, done, total: None)
     photos, output = Path(photos), Path(output)
     started = time.perf_counter()
+    check_photos(photos, output)
+    with _writing(output):
+        return _reconstruct(photos, output, config, overwrite, progress, started)
+
+
+def _reconstruct(
+    photos: Path, output: Path, config: SfmConfig, overwrite: bool, progress: Progress, started: float
+) -> SfmReport:
     _restore(output)
     _check_output(photos, output, overwrite)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -117,8 +126,40 @@ def reconstruct(
             masks=_files_in(work.scene / "masks"),
         )
         report.write(work.scene)
+        _check_output(photos, output, overwrite)  # another process may have been faster
         _move_in(work.scene, output)
     return report
+
+
+def check_photos(photos: Path, output: Path) -> None:
+    """Refuses a folder that does not exist, and an output in it, whose pictures would be taken for photos later.
+
+    Args:
+        photos: Folder of photos.
+        output: Where a scene or run is to be written.
+
+    Raises:
+        UserError: There is no such folder, or the output lies in it.
+    """
+    if not photos.is_dir():
+        raise UserError(f"{photos}: no such folder; give the folder that holds the photos")
+    place, folder = output.resolve(), photos.resolve()
+    if place.is_relative_to(folder):
+        raise UserError(
+            f"{output}: lies in the folder of the photos, {photos}, whose sub-folders are searched for photos; "
+            "choose another --output"
+        )
+
+
+@contextmanager
+def _writing(output: Path) -> Iterator[None]:
+    """Reports a disk that is full or cannot be written to as a user's mistake."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{output} cannot be written ({error}); free disk space, fix permissions or choose another --output"
+        ) from error
 
 
 def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
@@ -155,18 +196,15 @@ def _move_in(scene: Path, output: Path) -> None:
     output.mkdir(exist_ok=True)
     aside = output / ASIDE
     aside.mkdir()
-    moved: list[Path] = []
     try:
         for name in (*SCENE_PARTS, "depth"):
             if (output / name).exists():
                 (output / name).rename(aside / name)
+        (aside / MOVED).touch()
         # The report first: with it, what a killed process leaves is known as a scene of `wildgs sfm`.
         for item in sorted(scene.iterdir(), key=lambda item: item.name != REPORT_NAME):
             item.rename(output / item.name)
-            moved.append(output / item.name)
     except BaseException:
-        for item in moved:
-            shutil.rmtree(item) if item.is_dir() else item.unlink()
         _restore(output)
         raise
     kept = [_keep(aside / name, output) for name in _not_made_here(aside)]
@@ -187,11 +225,12 @@ def _restore(output: Path) -> None:
     if not aside.is_dir():
         return
     if not (aside / DONE).exists():
+        if (aside / MOVED).exists():
+            for new in (output / name for name in SCENE_PARTS):
+                shutil.rmtree(new) if new.is_dir() else new.unlink(missing_ok=True)
+            (aside / MOVED).unlink()  # first: what is put back from here on is not the new scene's
         for item in aside.iterdir():
-            new = output / item.name
-            if new.is_dir():
-                shutil.rmtree(new)
-            item.replace(new)
+            item.replace(output / item.name)
     shutil.rmtree(aside)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import unicodedata
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -106,15 +107,20 @@ def scene_names(names: Sequence[str]) -> list[str]:
     for name in names:
         path = PurePosixPath(*(_safe_part(part) for part in PurePosixPath(name).parts))
         stem = path.stem
-        if str(path.with_name(stem)).casefold() in taken:
+        if _folded(path.with_name(stem)) in taken:
             stem = f"{path.stem}_{path.suffix[1:].lower()}"
         number = 2
-        while str(path.with_name(stem)).casefold() in taken:
+        while _folded(path.with_name(stem)) in taken:
             stem, number = f"{path.stem}_{path.suffix[1:].lower()}_{number}", number + 1
-        taken.add(str(path.with_name(stem)).casefold())
+        taken.add(_folded(path.with_name(stem)))
         jpeg = path.suffix.lower() in (".jpg", ".jpeg") and stem == path.stem
         result.append(str(path if jpeg else path.with_name(f"{stem}.jpg")))
     return result
+
+
+def _folded(path: PurePosixPath) -> str:
+    """A name as file systems compare it that ignore case and how accents are composed."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", str(path)).casefold())
 
 
 def _safe_part(part: str) -> str:
