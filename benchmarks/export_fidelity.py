@@ -27,7 +27,7 @@ from wildgs.exporters.page_scene import pack_scene
 from wildgs.exporters.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
-from wildgs.library.webpage import baked, page_looks, viewpoints_of
+from wildgs.library.pages import baked, page_looks, viewpoints_of
 from wildgs.model.gaussians import NEAR
 from wildgs.rasterize import rasterize
 from wildgs.scene import View

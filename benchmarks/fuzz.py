@@ -352,7 +352,7 @@ class _Silent:
 
 
 def _read_messages(folder: Path) -> object:
-    from wildgs.viewer.messages import MalformedMessageError, decode, is_acceptable
+    from wildgs.viewer.access import MalformedMessageError, decode, is_acceptable
     from wildgs.viewer.uploads import Uploads
 
     uploads = Uploads(_Silent())

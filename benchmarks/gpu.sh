@@ -6,8 +6,8 @@
 # Stages, in this order, where none is named: install build parity eager graphs profile steps render train eval pack.
 # By name only: features (a step without each of WILDGS_WITHOUT's features), tests (all tests marked cuda).
 # Each has a limit, and its results are on disk before the next begins; what fails or runs out of time is in the JSON with
-# its exit code (124: out of time) and the rest goes on. The limits leave the last RESERVE seconds of the budget to
-# training and what follows. An interrupted build or training goes on with a second call and the same OUTPUT.
+# its exit code (124: out of time) and the rest continues. The limits leave the last RESERVE seconds of the budget to
+# training and what follows. An interrupted build or training continues with a second call and the same OUTPUT.
 #
 # --wheels: a folder with wheels of what the machine lacks, for machines without a package index; those are installed
 #   whose package is not there, without their dependencies, so that torch stays as it is. To fill it:
@@ -18,7 +18,7 @@
 set -uo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-scene= wheels= lpips= output=gpu-out budget=540 dry= stages=()
+scene= wheels= lpips= output=gpu-out budget= dry= stages=()
 while [ $# -gt 0 ]; do
   case $1 in
     --scene) scene=$2; shift 2 ;;
@@ -42,6 +42,7 @@ done
 
 python=${PYTHON:-python3}
 steps=${STEPS:-30000}
+[ -n "$budget" ] || budget=$([ -n "$dry" ] && echo 3000 || echo 540)
 reserve=170 # seconds of the budget for training, scores and packing
 parts=$output/parts
 export PYTHONPATH="$root/src:$root/benchmarks:$root${PYTHONPATH:+:$PYTHONPATH}" HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1}
@@ -51,7 +52,7 @@ tiny=() step_sizes=(--width 1000 --n 1000000 --steps 8) render_sizes=(--backends
 train_sizes=()
 if [ -n "$dry" ]; then
   export CUDA_VISIBLE_DEVICES=
-  tiny=(--tiny) step_sizes=(--width 48 --n 200 --steps 1) render_sizes=(--backends cpu --n 200 --sizes 32x24)
+  tiny=(--tiny) step_sizes=(--width 48 --n 200 --steps 1 --photos 8) render_sizes=(--backends cpu --n 200 --sizes 32x24)
   train_sizes=(--wrapping.resolution 8 --parsing.max-side 64 --max-gaussians 300 --log-every 1)
 elif [ -z "${TORCH_CUDA_ARCH_LIST:-}" ]; then
   # For this GPU alone: gsplat's kernels take minutes for each architecture.

@@ -3,7 +3,7 @@
     python benchmarks/identical_ranks.py [--processes 2] [--steps 200]
 
 Trains a small landmark with both methods for so many optimiser steps (each a photo on every rank) and compares
-SHA-256 over all that training needs to go on: parameters, Adam's moments, statistics, orders, generators. Exit code
+SHA-256 over all that resuming needs: parameters, Adam's moments, statistics, orders, generators. Exit code
 1 where ranks differ, or where nothing was densified.
 """
 

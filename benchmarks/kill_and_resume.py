@@ -1,7 +1,7 @@
 """Does a training that is killed again and again end in the same bits as one that is left alone?
 
 Trains a tiny landmark once undisturbed, then again with SIGKILL at random moments, part of them inside the writing
-of a checkpoint, and with SIGHUP (a closed terminal), going on with --resume after each. In every second training
+of a checkpoint, and with SIGHUP (a closed terminal), continuing with --resume after each. In every second training
 nobody reads what is printed: the pipe is closed after the first line. Prints a table and compares SHA-256 over all
 tensors.
 Methods that are not reproducible from run to run cannot be judged; that is checked first (exit code 3).
@@ -44,7 +44,7 @@ STAGES = (
 PRELOADED = [
     "wildgs.cli.train",
     "wildgs.library.training",
-    "wildgs.rasterize.cpu.backend",
+    "wildgs.rasterize.cpu",
     "torch.utils.tensorboard",
     "transformers",
 ]

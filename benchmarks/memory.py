@@ -85,13 +85,17 @@ def _train_in_memory(command: Command, count: int, side: int) -> int:
     from wildgs.model.registry import method_type
     from wildgs.scene import Alignment, Scene, View
     from wildgs.scene.images import Photo
-    from wildgs.scene.photo_store import MemoryPhotos
+    from wildgs.scene.photo_store import PhotoStore
+
+    class SamePhoto(PhotoStore):
+        def get(self, name: str) -> Photo:
+            return photo
 
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(count, 3, generator=generator) - torch.tensor([0.5, 0.5, -1.0])
     colors = torch.full((count, 3), 128, dtype=torch.uint8)
     photo = Photo(np.full((side, side, 3), 100, dtype=np.uint8))
-    photos = MemoryPhotos({f"{index}.jpg": photo for index in range(2)})
+    photos = SamePhoto()
     K = torch.tensor([[0.8 * side, 0, side / 2], [0, 0.8 * side, side / 2], [0, 0, 1]])
     views = tuple(
         View(

@@ -14,7 +14,7 @@ import tyro
 from PIL import Image
 
 from wildgs.evaluation.metrics import to_8bit
-from wildgs.library.showcase import different_lights
+from wildgs.library.pages import different_lights
 from wildgs.light.photos import encode_view
 from wildgs.model.method import Method
 from wildgs.runs import load_run

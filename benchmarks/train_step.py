@@ -202,7 +202,7 @@ def plain_steps(trainers: dict[MethodName, Trainer], count: int) -> dict[MethodN
     """Milliseconds of steps, the methods taking turns."""
     seconds: dict[MethodName, list[float]] = defaultdict(list)
     on_cuda = any(trainer.device.type == "cuda" for trainer in trainers.values())
-    warm_up = 20 if on_cuda else 2  # until every shape of photo has its graph
+    warm_up = 20 if on_cuda else min(2, count)  # until every shape of photo has its graph
     for index in range(count + warm_up):
         for name, trainer in trainers.items():
             rhythm = trainer.config.schedule.encoder_every
@@ -289,6 +289,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=12, help="timed steps a method")
     parser.add_argument("--n", type=int, help="this many Gaussians alone")
     parser.add_argument("--width", type=int, help="this many pixels on the long side alone")
+    parser.add_argument("--photos", type=int, default=PHOTOS, help="of the demo's landmark")
     parser.add_argument("--eager", action="store_true", help="on CUDA: networks without graphs")
     options = parser.parse_args()
     device = default_device()
@@ -298,7 +299,7 @@ def main() -> None:
     counts = (options.n,) if options.n else (COUNTS[:1] if options.quick else COUNTS)
     for width, _ in sizes:
         with tempfile.TemporaryDirectory() as folder:
-            scene = make_scene(Path(folder) / "scene", width)
+            scene = make_scene(Path(folder) / "scene", width, options.photos)
             for n in counts:
                 rows = measure(scene, n, options.steps, device, WildGSConfig(), graphs=not options.eager)
                 if options.json:

@@ -28,8 +28,8 @@ import tyro
 from PIL import Image
 
 import wildgs
-from wildgs.exporters.sheet import contact_sheet
-from wildgs.library.showcase import different_lights
+from wildgs.library.gallery import contact_sheet
+from wildgs.library.pages import different_lights
 from wildgs.light.look import Look
 from wildgs.light.photos import encode_view
 from wildgs.scene import View

@@ -20,9 +20,9 @@ import tyro
 
 from wildgs.engine.trainer import StepReport, Trainer
 from wildgs.runs import load_run, resume_training
-from wildgs.viewer.server import ServerConfig, open_server
+from wildgs.viewer.jobs import TrainingTurns
+from wildgs.viewer.serving import ServerConfig, open_server
 from wildgs.viewer.subject import TrainingSubject
-from wildgs.viewer.training import TrainingTurns
 from wildgs.viewer.viewer import Viewer, ViewerConfig
 
 AUDIENCE = """

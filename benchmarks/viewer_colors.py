@@ -30,9 +30,8 @@ from wildgs.evaluation.metrics import psnr, to_8bit
 from wildgs.rasterize import blend
 from wildgs.scene import View
 from wildgs.viewer.cameras import camera_of, fov_that_holds, pose_of
-from wildgs.viewer.display import SplatDisplay
-from wildgs.viewer.server import ServerConfig, address, open_server
-from wildgs.viewer.splats import colors_from
+from wildgs.viewer.display import SplatDisplay, colors_from
+from wildgs.viewer.serving import ServerConfig, address, open_server
 from wildgs.viewer.subject import Subject
 
 ASIDE = 0.1

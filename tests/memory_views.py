@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.scene import View
 from wildgs.scene.images import Photo
-from wildgs.scene.photo_store import MemoryPhotos, PhotoStore
+from wildgs.scene.photo_store import PhotoStore
+
+
+@dataclass
+class MemoryPhotos(PhotoStore):
+    """Photos that are in memory already.
+
+    Attributes:
+        photos: By name.
+        clean: Photos without their transients, by name.
+        truth_masks: True masks, by name.
+    """
+
+    photos: dict[str, Photo] = field(default_factory=dict)
+    clean: dict[str, UInt8[np.ndarray, "_ _ 3"]] = field(default_factory=dict)
+    truth_masks: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
+
+    def get(self, name: str) -> Photo:
+        return self.photos[name]
+
+    def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+        return self.clean.get(name)
+
+    def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
+        return self.truth_masks.get(name)
 
 
 def make_view(

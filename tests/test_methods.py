@@ -15,15 +15,16 @@ from wildgs.engine.density import DensityConfig
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError
-from wildgs.light.atlas import make_atlas
 from wildgs.light.look import look_of, mix
-from wildgs.light.photos import encode_view
+from wildgs.light.photos import encode_view, make_atlas
 from wildgs.light.saved import load_look, save_look
 from wildgs.model import registry
 from wildgs.model.appearance import Embeddings
 from wildgs.model.config import InitialConfig, ParsingConfig, SkyConfig, WrappingConfig
-from wildgs.model.method import GEOMETRY_ROWS, Method, Stage
+from wildgs.model.gaussians import GEOMETRY_ROWS
+from wildgs.model.method import Method
 from wildgs.model.registry import METHODS, create_method, method_type, restore_method
+from wildgs.model.training_pass import Stage
 from wildgs.presets import with_preset
 from wildgs.scene import Scene
 

@@ -51,7 +51,7 @@ class Record:
     capturing: bool = False
 
     def clear(self) -> None:
-        """Begins anew."""
+        """Starts again."""
         self.launches.clear()
         self.waits.clear()
         self.bytes = 0

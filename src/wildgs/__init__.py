@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from wildgs.library.benchmark import benchmark as benchmark
     from wildgs.library.config import MixOptions as MixOptions
     from wildgs.library.config import TrajectoryOptions as TrajectoryOptions
-    from wildgs.library.demo import demo as demo
     from wildgs.library.doctor import examine as examine
     from wildgs.library.evaluation import evaluate as evaluate
     from wildgs.library.exporting import export as export
     from wildgs.library.gallery import gallery as gallery
     from wildgs.library.loaded import LoadedScene as LoadedScene
+    from wildgs.library.loaded import appearance as appearance
     from wildgs.library.loaded import load as load
-    from wildgs.library.looks import appearance as appearance
+    from wildgs.library.pipeline import demo as demo
     from wildgs.library.pipeline import estimate_depth as estimate_depth
     from wildgs.library.pipeline import run as run
     from wildgs.library.rendering import render as render
@@ -49,9 +49,9 @@ _MODULES = {
     "TrajectoryOptions": "library.config",
     "UserError": "errors",
     "WildGSWarning": "errors",
-    "appearance": "library.looks",
+    "appearance": "library.loaded",
     "benchmark": "library.benchmark",
-    "demo": "library.demo",
+    "demo": "library.pipeline",
     "estimate_depth": "library.pipeline",
     "evaluate": "library.evaluation",
     "examine": "library.doctor",

@@ -1,4 +1,4 @@
-"""A run's whole configuration: the rooms' own dataclasses in one, readable and writable as YAML."""
+"""The configuration of a run: one dataclass of those of all packages, read and written as YAML."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_CONFIG_BYTES = 1_000_000
 
 
 _BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
-"""First and last line: a file that is cut off would be YAML still, and missing entries take their defaults."""
+"""First and last line: a truncated file could still be valid YAML, with defaults for what is missing."""
 _MOST = 1e9
 _RANGES: dict[str, tuple[float, float]] = {
     "data.downscale": (1, 1000),
@@ -60,7 +60,7 @@ _MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """How work is executed: without influence on the outcome, so that a resumed run takes it as given.
+    """How work is executed: without influence on the outcome, so that it may change when a run is resumed.
 
     Attributes:
         image_cache: Memory for decoded photos; photos beyond it are decoded again when their turn comes.
@@ -84,7 +84,7 @@ class ExecutionConfig:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuses values that mean nothing."""
+        """Checks the values."""
         parse_bytes(self.image_cache)
         parse_bytes(self.feature_cache)
         for name in ("checkpoint_every", "checkpoint_minutes", "log_every", "pictures_every", "threads"):
@@ -98,7 +98,7 @@ class RunConfig:
     """What decides a run's outcome.
 
     Attributes:
-        scene: The scene folder when the run was made; a place only, in which two equal configurations may differ.
+        scene: The scene folder at the time of training; not compared between configurations.
         method: A name in `wildgs.model.registry.METHODS`.
         data: How the scene is read.
         model: The method's own options, an instance of its `Config`; None takes the defaults.
@@ -112,7 +112,7 @@ class RunConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def __post_init__(self) -> None:
-        """Fills in the method's default options, and refuses those of another method."""
+        """Fills in the method's default options; those of another method are an error."""
         kind = config_type(self.method)
         if self.model is None:
             object.__setattr__(self, "model", kind())
@@ -139,21 +139,12 @@ def to_plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _shortened(value: Any) -> str:
-    """A value for a message; YAML's references can stand for more text than memory holds."""
-    return reprlib.repr(value)
-
-
 def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
     """The inverse of `to_plain`; missing entries take their defaults.
 
-    Args:
-        kind: The type to make.
-        value: Plain data, for example from YAML.
-        where: Named in errors.
-
     Raises:
-        UserError: An entry is unknown or of the wrong type.
+        UserError: An entry of `where` is unknown or of the wrong type. Values in messages are shortened
+            (`reprlib`).
     """
     if dataclasses.is_dataclass(kind):
         return _dataclass_from_plain(kind, value, where)
@@ -172,12 +163,12 @@ def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
         return float(value)
     if isinstance(kind, type) and type(value) is kind and value == value:  # NaN is nothing
         return value
-    raise UserError(f"{where}: {_shortened(value)} is not a {getattr(kind, '__name__', kind)}")
+    raise UserError(f"{where}: {reprlib.repr(value)} is not a {getattr(kind, '__name__', kind)}")
 
 
 def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, dict):
-        raise UserError(f"{where}: expected a mapping, found {_shortened(value)}")
+        raise UserError(f"{where}: expected a mapping, found {reprlib.repr(value)}")
     hints = typing.get_type_hints(kind)
     if kind is RunConfig:
         try:
@@ -199,13 +190,8 @@ def _method_of(plain: dict[Any, Any]) -> str:
     return str(plain.get("method", DEFAULT_METHOD))
 
 
-_MOVED_RATES = {
-    "intrinsic": "intrinsic",
-    "networks": "networks",
-    "encoder": "encoder",
-    "network_decay": "decay",
-    "sh0": "sh0",
-    "shN": "shN",
+_MOVED_RATES = {name: name for name in ("intrinsic", "networks", "encoder", "sh0", "shN")} | {
+    "network_decay": "decay"
 }
 """From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
 
@@ -254,11 +240,11 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return from_plain(kind, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {_shortened(value)} fits none of {kinds}")
+    raise UserError(f"{where}: {reprlib.repr(value)} fits none of {kinds}")
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain data without references, by which a small file can stand for more than memory holds."""
+    """Plain data without aliases, by which a small file can expand to more than memory holds."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -302,15 +288,10 @@ def read_config(path: Path) -> RunConfig:
 
 
 def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "config") -> RunConfig:
-    """A configuration with some entries changed.
-
-    Args:
-        config: Left as it is.
-        entries: From an entry's path, as in ``model.learning_rates.networks``, to its plain value.
-        where: Named in errors.
+    """A configuration with some entries (paths such as ``model.learning_rates.networks``) set to plain values.
 
     Raises:
-        UserError: There is no such entry, or the value is of the wrong type.
+        UserError: There is no such entry, or the value is of the wrong type; `where` is named in the message.
     """
     if isinstance(method := entries.get("method"), str):
         try:

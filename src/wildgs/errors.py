@@ -10,7 +10,7 @@ class UserError(Exception):
 
 
 class WildGSWarning(UserWarning):
-    """Something was left out and work goes on; the message says what is lost and how to get it."""
+    """Something was left out and work continues; the message says what is lost and how to get it."""
 
 
 class ReportedError(UserError):

@@ -68,7 +68,7 @@ def _succeeds(name: str, probe: Callable[[], object]) -> bool:
     except Exception as error:  # Triton, its compilers and the driver raise many kinds
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         warnings.warn(
-            f"Triton kernels cannot be used here ({reason}); training goes on without, slower "
+            f"Triton kernels cannot be used here ({reason}); training continues without, slower "
             f"(WILDGS_WITHOUT={name} leaves them out)",
             WildGSWarning,
             stacklevel=4,

@@ -90,6 +90,6 @@ if __name__ == "__main__":
     import wildgs.cli.train
     import wildgs.library.evaluation
     import wildgs.library.training
-    import wildgs.rasterize.cpu.backend  # noqa: F401
+    import wildgs.rasterize.cpu  # noqa: F401
 
     serve(Path(sys.argv[1]))

@@ -6,11 +6,13 @@ import csv
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 import pytest
 from PIL import Image
 
+from wildgs.config import RunConfig
 from wildgs.engine.trainer import Trainer
 from wildgs.scene import Scene
 
@@ -91,14 +93,14 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
 ) -> None:
     from wildgs.library import benchmark as bench
 
-    train_job = bench.train_job
+    train = bench.train
 
-    def refuses_the_first(job: bench.Job, scene: Scene, request: bench._Request) -> None:
-        if job.method == "3dgs":
+    def refuses_the_first(scene: Scene, config: RunConfig, *, output: Path, **options: Any) -> None:
+        if output.parent.name == "3dgs":
             raise MemoryError
-        train_job(job, scene, request)
+        train(scene, config, output=output, **options)
 
-    monkeypatch.setattr(bench, "train_job", refuses_the_first)
+    monkeypatch.setattr(bench, "train", refuses_the_first)
     variant = ("--methods", "3dgs", "--variant", "plain:method=3dgs,train.steps=1", "--seeds", 0)
     assert wildgs("bench", landmark, "--output", tmp_path, *TINY, *variant) == 2
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]

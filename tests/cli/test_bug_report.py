@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from wildgs.library import bug_report
-from wildgs.library.bug_report import without_names, write_report
+from wildgs.library import doctor as bug_report
+from wildgs.library.doctor import without_names, write_report
 
 
 @pytest.mark.parametrize(

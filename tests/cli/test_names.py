@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from wildgs.library.showcase import write_showcase
+from wildgs.library.pages import write_showcase
 from wildgs.runs import load_run
 
 NAMES = ["2023-07-14 18:22:31.png", "caf\udce9.png", "ü [b]x[/b].png", "<img src=x>.png", "p5.png", "p6.png"]

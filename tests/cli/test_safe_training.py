@@ -18,7 +18,7 @@ from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
+from wildgs.library.logs import InterruptedTrainingError, StopOnSignal
 from wildgs.library.training import train
 from wildgs.runs import load_run, lock_run
 
@@ -203,7 +203,7 @@ def test_memory_that_runs_out_is_tried_again_with_fewer(
     run = tmp_path / "run"
     call_at_step(monkeypatch, 12, out_of_memory)
     assert wildgs("train", landmark, "--output", run, *TRAIN) == 0
-    assert "memory ran out; going on from the newest checkpoint with at most" in capsys.readouterr().err
+    assert "memory ran out; continuing from the newest checkpoint with at most" in capsys.readouterr().err
     loaded = load_run(run)
     budget = yaml.safe_load((run / "config.yaml").read_text())["train"]["density"]["max_gaussians"]
     assert loaded.step == 24

@@ -17,7 +17,7 @@ from wildgs.runs import load_run
 
 pytestmark = pytest.mark.timeout(1200)
 SOURCE = Path(__file__).parents[2] / "src"
-TRAIN = ("--method", "3dgs", "--steps", "240", "--checkpoint-every", "20")
+TRAIN = ("--method", "3dgs", "--steps", "400", "--checkpoint-every", "20")
 LAUNCH = (
     sys.executable,
     "-m",
@@ -80,7 +80,7 @@ def test_stop_then_lose_a_rank_then_go_on_alone(landmark: Path, tmp_path: Path, 
     step = load_run(run).step
     assert line.startswith(f"interrupted at step {step}")
     assert step % 2 == 0
-    assert output.count("training 3dgs on 2 processes: 240 steps") == 1
+    assert output.count("training 3dgs on 2 processes: 400 steps") == 1
     assert output.count("photos train") == 1
 
     process = torchrun("train", landmark, "--output", run, "--resume", *TRAIN[-2:])
@@ -94,10 +94,10 @@ def test_stop_then_lose_a_rank_then_go_on_alone(landmark: Path, tmp_path: Path, 
     assert load_run(run).step > step
 
     assert wildgs("train", landmark, "--output", run, "--resume") == 0
-    assert load_run(run).step == 240
+    assert load_run(run).step == 400
     steps = [json.loads(line)["step"] for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert steps == sorted(set(steps))
-    assert steps[-1] == 240
+    assert steps[-1] == 400
 
 
 def test_a_mistake_is_told_once(tmp_path: Path) -> None:

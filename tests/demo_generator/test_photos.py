@@ -78,7 +78,7 @@ def test_points_are_seen_by_several_photos_near_their_projections(model: pycolma
 
 @pytest.fixture(scope="module")
 def depths(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
-    """Depth without visitors, traced anew through the poses that the model file states."""
+    """Depth without visitors, traced again through the poses that the model file states."""
     solids = Solids()
     add_landmark(solids)
     add_surroundings(solids, np.random.default_rng(3))

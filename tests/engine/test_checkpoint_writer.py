@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.engine import checkpoint_writer
+from wildgs.engine import autosave
+from wildgs.engine.autosave import CheckpointWriter
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
-from wildgs.engine.checkpoint_writer import CheckpointWriter
 from wildgs.errors import UserError
 
 
 def test_what_training_changes_meanwhile_is_not_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    save, go = checkpoint_writer.save_checkpoint, threading.Event()
-    monkeypatch.setattr(checkpoint_writer, "save_checkpoint", lambda *given: go.wait(20) and save(*given))
+    save, go = autosave.save_checkpoint, threading.Event()
+    monkeypatch.setattr(autosave, "save_checkpoint", lambda *given: go.wait(20) and save(*given))
     writer = CheckpointWriter(background=True)
     values = torch.zeros(3)
     writer.save(tmp_path, 7, {"values": values}, {"a": 1})

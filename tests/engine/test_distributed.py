@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 
+from wildgs.engine.feed import ViewSampler
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
-from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError

@@ -146,7 +146,7 @@ def test_a_photo_that_vanishes_is_passed_over(wall_scene: Scene) -> None:
     ]
     trainer = trainer_for(replace(wall_scene, views=tuple(views)), 20)
     names: list[str] = []
-    with pytest.warns(WildGSWarning, match=r"2\.jpg: no such file.*goes on without it") as caught:
+    with pytest.warns(WildGSWarning, match=r"2\.jpg: no such file.*continues without it") as caught:
         trainer.run([lambda report: names.append(report.view.name)])
     assert len(caught) == 1
     assert len(names) == 20
@@ -196,7 +196,7 @@ def test_a_full_disk_does_not_end_training(monkeypatch) -> None:
             now[0] += 1.0
             autosave(report_at(step))
 
-    with pytest.warns(WildGSWarning, match="training goes on and tries again") as caught:
+    with pytest.warns(WildGSWarning, match="training continues and tries again") as caught:
         train()
     assert len(caught) == 2
     assert attempts[:3] == [60.0, 120.0, 180.0]
@@ -216,7 +216,7 @@ def test_records_that_cannot_be_written_do_not_end_training(
     with Recorder(tmp_path, scalars_every=1, pictures_every=100) as recorder:
         recorder._lines.close()
         monkeypatch.setattr(recorder, "_lines", SimpleNamespace(write=full, close=lambda: None))
-        with pytest.warns(WildGSWarning, match=r"metrics\.jsonl.*training goes on") as caught:
+        with pytest.warns(WildGSWarning, match=r"metrics\.jsonl.*training continues") as caught:
             trainer.run([recorder])
     assert trainer.step == 6
     assert len(caught) == 1

@@ -116,7 +116,7 @@ def test_a_resumed_run_ends_in_the_same_bits(
 def test_checkpoint_holds_all_that_training_needs(
     wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path
 ) -> None:
-    """The state comes back bit for bit, networks and moments in their layout, and training goes on from it."""
+    """The state comes back bit for bit, networks and moments in their layout, and training continues from it."""
     first = trainer_for(wall_scene, tiny_model, 60, schedule=SCHEDULE)
     first.run([lambda r: save_checkpoint(tmp_path, r.step, first.state(), {}) if r.step == 30 else None])
     checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])

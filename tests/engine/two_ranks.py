@@ -106,13 +106,13 @@ def mistakes(output: Path, team: Team) -> None:
             raise UserError(message)
 
     def one_fails() -> None:
-        with team.together():
+        with team.propagate_errors():
             fail("no such folder", only=1)
 
     def both_warn() -> int:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            with team.together():
+            with team.propagate_errors():
                 warnings.warn("of both", WildGSWarning, stacklevel=1)
         return len(caught)
 
@@ -121,12 +121,12 @@ def mistakes(output: Path, team: Team) -> None:
         team.average([torch.nn.Parameter(torch.zeros(3 + team.rank))], Losses(zero, zero, zero, zero))
 
     def stop() -> tuple[int, int]:
-        before = team.verdict
-        team.wish = 15 if team.rank == 1 else 0
+        before = team.stop_signal
+        team.received_signal = 15 if team.rank == 1 else 0
         zero = torch.zeros(())
         team.average([], Losses(zero, zero, zero, zero))
-        team.wish = 0
-        return before, team.verdict
+        team.received_signal = 0
+        return before, team.stop_signal
 
     def partly_without_gradient() -> list[object]:
         here, nowhere = torch.nn.Parameter(torch.zeros(2)), torch.nn.Parameter(torch.zeros(2))

@@ -14,6 +14,7 @@ import torch
 
 import wildgs
 from benchmarks.resized_demo import write_resized_demo
+from tests.memory_views import MemoryPhotos
 from wildgs.config import RunConfig
 from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.evaluation.photos import (
@@ -29,7 +30,6 @@ from wildgs.model.config import ParsingConfig, WildGSConfig, WrappingConfig
 from wildgs.model.wildgs import WildGS
 from wildgs.runs import load_run
 from wildgs.scene.images import Photo
-from wildgs.scene.photo_store import MemoryPhotos
 
 
 @pytest.fixture

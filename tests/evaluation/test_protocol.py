@@ -14,8 +14,9 @@ from wildgs.evaluation.lpips import ENVIRONMENT
 from wildgs.evaluation.protocol import evaluate
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance
-from wildgs.model.gaussians import Gaussians, geometry_from_points
-from wildgs.model.method import GEOMETRY_ROWS, Method, Stage, TrainingOutput
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, geometry_from_points
+from wildgs.model.method import Method
+from wildgs.model.training_pass import Stage, TrainingOutput
 from wildgs.rasterize import Rendering
 from wildgs.scene.scene import Alignment, Scene, View
 
@@ -28,7 +29,7 @@ class Painter(Method):
     def __init__(self, paint: Callable[[torch.Tensor], torch.Tensor], mask: bool = True) -> None:
         super().__init__()
         self.gaussians = Gaussians(geometry_from_points(torch.rand(7, 3)))
-        self.paint = paint
+        self.painting = paint
         self.mask = mask
         self.shown: list[tuple[torch.Tensor, Camera]] = []
         self.keeps: list[torch.Tensor | None] = []
@@ -63,7 +64,7 @@ class Painter(Method):
         raise AssertionError("evaluation must not train")
 
     def render(self, camera, sh, *, background=None):
-        colors = self.paint(self.shown[-1][0])
+        colors = self.painting(self.shown[-1][0])
         assert colors.shape == (camera.height, camera.width, 3)
         return Rendering(colors, torch.ones(H, W), torch.ones(H, W))
 

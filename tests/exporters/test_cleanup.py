@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from wildgs.exporters.cleanup import CleanupConfig, agreement, clean, kept_rows
-from wildgs.exporters.splats import Splats
+from wildgs.exporters.splats import CleanupConfig, Splats, agreement, clean, kept_rows
 from wildgs.geometry.camera import Camera
 
 POINTS = torch.tensor([[x, y, 0.0] for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import ImageFont
 
-from wildgs.exporters.sheet import GAP, PAPER, contact_sheet, fit, shorten
+from wildgs.library.gallery import GAP, PAPER, contact_sheet, fit, shorten
 
 
 def flat(width: int, height: int, color: tuple[int, int, int]) -> np.ndarray:

@@ -8,8 +8,7 @@ import torch
 
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.lens import Lens, focal_of, focus, forwards_of, positions_of
-from wildgs.geometry.tour import open_tour, spread_out
-from wildgs.geometry.trajectory import interpolate, orbit, spiral, still, training_path
+from wildgs.geometry.trajectory import interpolate, open_tour, orbit, spiral, spread_out, still, training_path
 
 FRAMES, SIZE = 60, (96, 64)
 

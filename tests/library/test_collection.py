@@ -91,7 +91,7 @@ def test_every_photo_has_a_limit_of_its_own_unless_the_run_began_otherwise(tmp_p
 
 
 def test_options_that_are_left_out_are_those_of_the_run(tmp_path: Path) -> None:
-    """A bare `wildgs run PHOTOS --output RUN` goes on; what is given again is compared with the run."""
+    """A bare `wildgs run PHOTOS --output RUN` continues; what is given again is compared with the run."""
     file = tmp_path / "config.yaml"
     data, train = wildgs.DataConfig(downscale=2.0, holdout=4), wildgs.TrainConfig(steps=7)
     begun = wildgs.RunConfig(tmp_path, data=data, train=train)

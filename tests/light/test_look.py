@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from wildgs.errors import UserError
-from wildgs.light.look import Look, look_of, mix, own_look
+from wildgs.light.look import Look, look_of, mix, own_look, with_sky
 from wildgs.light.photos import encode_view
+from wildgs.light.saved import load_look, save_look
 
 
 @pytest.fixture
@@ -75,3 +76,24 @@ def test_plain_3dgs_has_one_look(vanilla) -> None:
     look = own_look(vanilla)
     assert look.sh.shape == (vanilla.num_gaussians, 16, 3)
     assert mix([look, look], [0.5, 0.5]) is look
+
+
+def test_the_sky_of_another_look(method, looks, tmp_path) -> None:
+    own, other = looks[:2]
+    which = method.sky()
+    assert 0 < int(which.sum()) < len(which)
+    swapped = with_sky(own, other)
+    assert torch.equal(swapped.sh[which], other.sh[which])
+    assert torch.equal(swapped.sh[~which], own.sh[~which])
+    assert swapped.name == "0.jpg under the sky of 1.jpg"
+    back = load_look(method, save_look(swapped, tmp_path / "swapped.safetensors"))
+    torch.testing.assert_close(back.sh, swapped.sh, atol=0.01, rtol=0.01)
+    assert torch.equal(mix([swapped, own], [0, 1]).sh, own.sh)
+    assert torch.equal(mix([swapped, own], [1, 0]).sh, swapped.sh)
+    assert torch.equal(with_sky(other, swapped).sh, other.sh), "the sky that is shown, not the scene below it"
+
+
+def test_no_sky_to_swap_is_one_line(vanilla) -> None:
+    look = own_look(vanilla)
+    with pytest.raises(UserError, match="no sky apart"):
+        with_sky(look, look)

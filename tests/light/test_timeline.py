@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from wildgs.errors import UserError
-from wildgs.light.look import look_of
+from wildgs.light.look import Timeline, look_of
 from wildgs.light.photos import encode_view
-from wildgs.light.timeline import Timeline
 
 
 @pytest.fixture

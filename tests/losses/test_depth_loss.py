@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.geometry.camera import Camera
-from wildgs.losses.depth import depth_correlation
+from wildgs.losses.objective import depth_correlation
 
 H, W = 30, 40
 EVERYWHERE = torch.ones(H, W, dtype=torch.bool)

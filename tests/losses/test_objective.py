@@ -1,11 +1,9 @@
 import pytest
 import torch
 
-from wildgs.losses.depth import depth_correlation
-from wildgs.losses.objective import ObjectiveConfig, total_loss
+from wildgs.losses.objective import ObjectiveConfig, depth_correlation, total_loss, visibility_regularizer
 from wildgs.losses.photometric import masked_photometric
 from wildgs.losses.ssim import ssim_map
-from wildgs.losses.visibility import visibility_regularizer
 
 H, W = 24, 32
 

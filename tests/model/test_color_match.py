@@ -93,11 +93,43 @@ def test_mapped_harmonics_are_those_of_mapped_colours() -> None:
 def test_a_changed_picture_is_the_picture_of_changed_harmonics() -> None:
     generator = torch.Generator().manual_seed(0)
     colors = torch.rand(24, 30, 3, generator=generator)
+    codes = torch.rand(24, 30, 2, generator=generator)
     sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
     sky = Sky(sine > 0.4, sine)
-    change = 0.2 * (torch.rand(3, 4 + SKY_COLUMNS, generator=generator) - 0.5)
+    change = 0.2 * (torch.rand(3, 6 + SKY_COLUMNS, generator=generator) - 0.5)
     flat = ((colors - 0.5) / C0).reshape(-1, 1, 3)
     rows = Sky(sky.which.reshape(-1), sky.sine.reshape(-1))
-    expected = (C0 * changed_harmonics(flat, change, rows) + 0.5).reshape(colors.shape)
-    torch.testing.assert_close(changed_picture(colors, change, sky), expected)
-    torch.testing.assert_close(changed_picture(colors, change[:, :4], None), changed(colors, change[:, :4]))
+    for of_picture, of_rows in ((sky, rows), (None, None)):
+        harmonics = changed_harmonics(flat, change, of_rows, codes.reshape(-1, 2))
+        expected = (C0 * harmonics + 0.5).reshape(colors.shape)
+        torch.testing.assert_close(changed_picture(colors, change, of_picture, codes), expected)
+    expected = changed(colors, change[:, :4]) + codes @ change[:, 4:6].T
+    torch.testing.assert_close(changed_picture(colors, change, None, codes), expected)
+
+
+def test_light_that_follows_the_codes_is_found() -> None:
+    """Sun on one side of the scene, shade on the other: the codes say which side is which."""
+    generator = torch.Generator().manual_seed(0)
+    render, codes = torch.rand(24, 30, 3, generator=generator), torch.zeros(24, 30, 1)
+    codes[:, :15] = 1
+    photo = 0.8 * render + 0.15 * codes
+    for training in (False, True):
+        found = match_colors(render, photo, torch.ones(24, 30), training, codes)
+        torch.testing.assert_close(changed_picture(render, found, None, codes), photo, atol=0.01, rtol=0)
+
+
+def test_in_training_channels_do_not_mix() -> None:
+    """However little a render's hue says about the photo's, the match must not take it away."""
+    generator = torch.Generator().manual_seed(0)
+    grey = torch.rand(24, 30, 1, generator=generator)
+    render = grey + 0.05 * torch.randn(24, 30, 3, generator=generator)
+    photo = torch.tensor([0.8, 1.0, 0.6]) * grey.expand(24, 30, 3) + 0.1
+    weights, sine = torch.ones(24, 30), torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
+    for found in (match_colors(render, photo, weights, True), match_sky(render, photo, weights, sine, True)):
+        off_diagonal = ~torch.eye(3, dtype=torch.bool)
+        assert not found[:, :3][off_diagonal].any()
+        assert float((changed(render, found[:, :4]) - photo).abs().mean()) < 0.06
+    free = match_colors(render, photo, weights)
+    hue = torch.tensor([1.0, -1.0, 0.0])
+    kept = (hue + free[:, :3] @ hue).norm() / hue.norm()
+    assert float(kept) < 0.5, "the full map does take it away"

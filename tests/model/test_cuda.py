@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from wildgs.model.encoder import FrozenBatchNorm
+from wildgs.model.gaussians import rows_to_shade, take_rows
 from wildgs.model.parsing import Parsing, ParsingConfig
-from wildgs.model.rows import rows_to_shade, take_rows
 from wildgs.model.triplane import project_cloud, sample_planes
 
 pytestmark = [pytest.mark.cuda, pytest.mark.filterwarnings("ignore:no ImageNet weights")]

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.model.light_basis import LEAST_PIXELS, LightBasis, fit_weights
-from wildgs.model.method import SeenPhoto
 from wildgs.model.registry import restore_method
+from wildgs.model.training_pass import SeenPhoto
 from wildgs.model.wildgs import WildGS
 
 

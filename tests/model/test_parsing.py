@@ -13,8 +13,7 @@ from transformers import ResNetConfig, ResNetModel
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.config import SQUEEZENET, ParsingConfig
 from wildgs.model.encoder import RESNET_WIDTHS, FrozenBatchNorm, SqueezeNetEncoder, load_encoder
-from wildgs.model.feature_cache import FeatureCache, pack, unpack
-from wildgs.model.parsing import Parsing
+from wildgs.model.parsing import FeatureCache, Parsing, pack, unpack
 from wildgs.model.precision import lay_out_channels_last, set_precision
 from wildgs.model.replays import MOST_GRAPHS
 

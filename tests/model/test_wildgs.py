@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings
-from wildgs.model.lifting import lift, liftable, random_part
-from wildgs.model.method import Stage
 from wildgs.model.registry import restore_method
+from wildgs.model.training_pass import Stage
 from wildgs.model.vanilla import VanillaConfig, VanillaGS
 from wildgs.model.wildgs import WildGS
+from wildgs.model.wrapping import lift, liftable, random_part
 from wildgs.rasterize import blend
 
 

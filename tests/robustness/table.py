@@ -1,7 +1,7 @@
 """What happens for every input and every fault: the tests' expectation and the table in docs/robustness.md, in one.
 
 Kinds: `error` ends with one line that names the file, before or without any loss; `left out` warns, names what is
-left out and goes on; `used` goes on as if nothing were wrong, for the reason given; None does not exist.
+left out and continues; `used` continues as if nothing were wrong, for the reason given; None does not exist.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MODEL: dict[str, Cell] = {
     "truncated": ("error", "the COLMAP model cannot be read", "error"),
     "wrong type": ("error", "the COLMAP model cannot be read", "error"),
     "wrong size": ("error", "camera 1 is 0x16 pixels", "error: a camera without area, or over 10^6 wide"),
-    "NaN": ("left out", r"p02\.png.*its pose is no finite number", "photo left out; such points are dropped"),
+    "NaN": ("left out", r"p02\.png.*its pose is not finite", "photo left out; such points are dropped"),
     "huge": ("error", "the COLMAP model cannot be read", "error, before anything is allocated"),
     "duplicate": ("error", "in the COLMAP model twice", "error"),
     "names": ("used", "", "used"),

@@ -90,7 +90,7 @@ def test_verbs_work_on_the_run_alone(moved: Path, tmp_path: Path, monkeypatch) -
 
 
 def test_the_viewer_opens_on_the_run_alone(moved: Path) -> None:
-    from wildgs.viewer.comparison import compare
+    from wildgs.viewer.photos import compare
     from wildgs.viewer.subject import Subject
 
     scene = wildgs.load(moved, CPU)

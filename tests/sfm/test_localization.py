@@ -204,10 +204,10 @@ def test_what_a_run_carries_is_enough(corner, known_corner, save_query, tmp_path
 
 
 def test_landmarks_are_kept_and_made_anew_for_another_model(known_corner, tmp_path, monkeypatch) -> None:
-    cache = tmp_path / "landmarks.safetensors"
+    cache = tmp_path / "feature_index.safetensors"
     first = load_feature_index(known_corner, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(feature_index_module, "_index_features", lambda *_: pytest.fail("found anew"))
+        patch.setattr(feature_index_module, "_index_features", lambda *_: pytest.fail("detected again"))
         second = load_feature_index(known_corner, cache)
     assert np.array_equal(first.descriptors, second.descriptors)
     assert np.array_equal(first.points, second.points)
@@ -222,7 +222,7 @@ def test_landmarks_are_kept_and_made_anew_for_another_model(known_corner, tmp_pa
 
 def test_a_folder_that_cannot_be_written_to_is_no_fault(known_corner, monkeypatch, corner_landmarks) -> None:
     monkeypatch.setattr(feature_index_module, "_index_features", lambda *_: corner_landmarks)
-    assert len(load_feature_index(known_corner, Path("/proc/none/landmarks.safetensors")).points)
+    assert len(load_feature_index(known_corner, Path("/proc/none/feature_index.safetensors")).points)
 
 
 def test_a_model_without_observations_is_said(make_scene) -> None:

@@ -15,7 +15,8 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.colmap import read_model
 from wildgs.sfm import mapping, reconstruction
-from wildgs.sfm.reconstruction import PairingConfig, SfmConfig, reconstruct
+from wildgs.sfm.config import PairingConfig, SfmConfig
+from wildgs.sfm.reconstruction import reconstruct
 
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
 EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3))

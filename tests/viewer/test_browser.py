@@ -21,7 +21,7 @@ from PIL import Image
 from wildgs.evaluation.metrics import psnr
 from wildgs.viewer.cameras import Pose, camera_of, pose_of
 from wildgs.viewer.jobs import start_worker
-from wildgs.viewer.server import ServerConfig, address, open_server
+from wildgs.viewer.serving import ServerConfig, address, open_server
 from wildgs.viewer.subject import Subject
 from wildgs.viewer.viewer import Viewer, ViewerConfig
 

@@ -7,7 +7,7 @@ import numpy as np
 from tests.memory_views import make_view
 from wildgs.engine.trainer import Trainer
 from wildgs.exporters.depth_colors import HIDDEN_TINT, tint_hidden
-from wildgs.viewer.comparison import LONG_SIDE, compare
+from wildgs.viewer.photos import LONG_SIDE, compare
 from wildgs.viewer.subject import Subject
 
 

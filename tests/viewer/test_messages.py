@@ -11,8 +11,8 @@ viser = pytest.importorskip("viser", reason="the extra 'viewer' is not installed
 
 import msgspec  # noqa: E402
 
-from wildgs.viewer.messages import MalformedMessageError, decode, is_acceptable  # noqa: E402
-from wildgs.viewer.server import ServerConfig, open_server  # noqa: E402
+from wildgs.viewer.access import MalformedMessageError, decode, is_acceptable  # noqa: E402
+from wildgs.viewer.serving import ServerConfig, open_server  # noqa: E402
 
 CAMERA: dict[str, Any] = {
     "type": "ViewerCameraMessage",

@@ -13,10 +13,9 @@ from wildgs.errors import UserError
 from wildgs.geometry.camera_file import read_camera_path
 from wildgs.scene import Scene
 from wildgs.viewer.cameras import pose_of
-from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.lighting import Light, LightDesk
-from wildgs.viewer.recording import MAX_VIEWS, RecordingPanel
-from wildgs.viewer.server import ServerConfig, open_server
+from wildgs.viewer.recording import MAX_VIEWS, RecordingPanel, free_name, make_film
+from wildgs.viewer.serving import ServerConfig, open_server
 from wildgs.viewer.subject import Subject
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
@@ -46,7 +45,7 @@ def test_views_are_kept_in_order_and_taken_away_from_the_end(panel: RecordingPan
 
 
 def test_a_view_is_the_camera_at_the_moment(panel: RecordingPanel, wall: Scene) -> None:
-    """viser's camera is one object that goes on moving."""
+    """viser's camera is one object that continues moving."""
     pose = pose_of(wall.views[0].camera)
     panel.add(pose)
     pose.position[:] = np.nan

@@ -15,7 +15,7 @@ import pytest
 
 from wildgs.errors import UserError
 from wildgs.viewer.access import AccessControl
-from wildgs.viewer.server import ServerConfig, address, open_server, public_address
+from wildgs.viewer.serving import ServerConfig, address, open_server, public_address
 
 viser = pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 

@@ -7,7 +7,7 @@ import torch
 
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
-from wildgs.viewer.splats import ENLARGED, colors_from, distances_from, splats_of
+from wildgs.viewer.display import ENLARGED, colors_from, distances_from, splats_of
 
 
 def gaussians(count: int = 6) -> Gaussians:

@@ -7,8 +7,7 @@ import itertools
 import pytest
 
 from wildgs.engine.trainer import StepReport
-from wildgs.viewer.jobs import Jobs
-from wildgs.viewer.training import SHARE, TrainingTurns
+from wildgs.viewer.jobs import SHARE, Jobs, TrainingTurns
 
 REPORT = StepReport.__new__(StepReport)
 

@@ -19,9 +19,9 @@ from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError
 from wildgs.scene import Scene
 from wildgs.viewer.cameras import Pose
+from wildgs.viewer.display import colors_from
 from wildgs.viewer.lighting import KEPT_UPLOADS, UPLOAD_SIDE, Light
-from wildgs.viewer.server import ServerConfig, open_server
-from wildgs.viewer.splats import colors_from
+from wildgs.viewer.serving import ServerConfig, open_server
 from wildgs.viewer.subject import Subject, TrainingSubject
 from wildgs.viewer.viewer import Viewer, ViewerConfig
 

@@ -44,8 +44,8 @@ SHOWN = (
 class Command:
     """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
 
-    The same command goes on where it stopped and skips what is done; with more scenes, methods, variants or
-    seeds it does what is new. The table (table.md, table.csv, table.json) is written anew after every run.
+    The same command continues where it stopped and skips what is done; with more scenes, methods, variants or
+    seeds it does what is new. The table (table.md, table.csv, table.json) is rewritten after every run.
     Several processes with one --output share the work, started by torchrun or by this command several times: each
     takes the next run that no other one trains.
 
@@ -76,7 +76,7 @@ class Command:
 
 
 def run(command: Command) -> None:
-    """Does what is not done yet; a run that fails is named, and the others go on.
+    """Does what is not done yet; a run that fails is named, and the others continue.
 
     Raises:
         UserError: The command makes no sense, or some runs failed.

@@ -34,8 +34,7 @@ def run(command: Command) -> None:
     Raises:
         UserError: With --build-gsplat: the extension cannot be built.
     """
-    from wildgs.library.bug_report import write_report
-    from wildgs.library.doctor import build_gsplat, examine
+    from wildgs.library.doctor import build_gsplat, examine, write_report
 
     if command.build_gsplat:
         build_gsplat()

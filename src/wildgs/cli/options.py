@@ -28,7 +28,7 @@ class LightOptions(MixOptions):
     @property
     def mixing(self) -> MixOptions:
         """How the appearances are found and mixed."""
-        return MixOptions(self.weights, self.global_, self.local, self.like)
+        return MixOptions(self.weights, self.global_, self.local, self.like, self.sky)
 
 
 def option_name(path: str) -> str:

@@ -20,7 +20,7 @@ class Command:
     """Poses, trains, scores and shows a folder of photos.
 
     Steps and size follow the machine unless given: 30,000 steps on photos of up to 1,600 pixels on a GPU, 3,000
-    steps on photos of up to 400 pixels on a CPU. The same command goes on where it was interrupted.
+    steps on photos of up to 400 pixels on a CPU. The same command continues where it was interrupted.
 
     Example: wildgs run photos/sacre_coeur --output runs/sacre_coeur
     """

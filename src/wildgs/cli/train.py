@@ -163,8 +163,7 @@ def _refuse_changes(command: Command, config: RunConfig) -> None:
 
 
 def _window(command: Command) -> TrainingWindow:
-    from wildgs.viewer.server import import_viser
-    from wildgs.viewer.serving import TrainingWindow
+    from wildgs.viewer.serving import TrainingWindow, import_viser
 
     import_viser()  # its absence is reported before photos are read
     return TrainingWindow(command.server, command.output.resolve().name, announce=console.print)

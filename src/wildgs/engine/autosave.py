@@ -1,14 +1,75 @@
-"""Checkpoints while training goes on: by steps and by time, and a full disk does not end the training."""
+"""Checkpoints during training: when one is due, who writes it, and what happens where the disk is full."""
 
 from __future__ import annotations
 
 import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from wildgs.engine.checkpoint import save_checkpoint
 from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError, WildGSWarning
+
+
+class CheckpointWriter:
+    """Writes checkpoints, if `background` by a thread: training then waits only for the copy to main memory.
+
+    On the CPU the thread would take a core from training.
+    """
+
+    def __init__(self, background: bool) -> None:
+        self.background = background
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="wildgs-checkpoint") if background else None
+        self._pending: Future[Path] | None = None
+        self._copies: dict[str, Tensor] = {}
+
+    def save(self, folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> None:
+        """Writes a checkpoint as `save_checkpoint` does, once the one before is written.
+
+        Raises:
+            UserError: This checkpoint, or in the background the one before it, could not be written.
+        """
+        if self._thread is None or not self.background:
+            save_checkpoint(folder, step, state, header)
+            return
+        self.wait()
+        self._pending = self._thread.submit(save_checkpoint, folder, step, self._copied(state), header)
+
+    def wait(self) -> None:
+        """Waits for the checkpoint that is being written; raises its `UserError` if it could not be."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
+
+    def finish(self) -> bool:
+        """Waits, and writes later checkpoints synchronously; returns whether the last one was written."""
+        self.background = False
+        try:
+            self.wait()
+        except UserError:
+            return False
+        return True
+
+    def _copied(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The state in main memory; page-locked for tensors on a GPU, and kept for the next checkpoint."""
+        on_cuda = any(value.is_cuda for value in state.values())
+        kept: dict[str, Tensor] = {}
+        for name, value in state.items():
+            copy = self._copies.get(name)
+            if copy is None or (copy.shape, copy.dtype) != (value.shape, value.dtype):
+                copy = torch.empty(value.shape, dtype=value.dtype, pin_memory=value.is_cuda)
+            kept[name] = copy.copy_(value.detach(), non_blocking=True)
+        if on_cuda:
+            torch.cuda.synchronize()
+        self._copies = kept
+        return kept
+
 
 RETRY_SECONDS = 60.0
 LAST_TRIES, LAST_WAIT = 6, 10.0
@@ -16,10 +77,9 @@ LAST_TRIES, LAST_WAIT = 6, 10.0
 
 
 class Autosave:
-    """An observer of training that saves what is worth saving.
+    """An observer of training that saves checkpoints when they are due.
 
-    Steps that were skipped for a non-finite loss or gradient are not: nothing was learnt in them, and what made
-    them fail may be in the parameters already.
+    Not after a step that was skipped for a non-finite loss or gradient: its cause may be in the parameters.
     """
 
     def __init__(
@@ -32,15 +92,15 @@ class Autosave:
         rescue: Callable[[], Path] | None = None,
         least_seconds: float = 0.0,
     ) -> None:
-        """Sets up an `Autosave`.
+        """Sets when and how to save.
 
         Args:
             save: Writes a checkpoint of the trainer's present state; raises `UserError` where it cannot.
             every: Steps between checkpoints.
             minutes: Minutes between checkpoints; whichever comes first.
             step: The step of the newest checkpoint.
-            rescue: Writes the state to another place, where the last checkpoint cannot be written to its own.
-            least_seconds: Time between two checkpoints, however many steps it is.
+            rescue: Writes the state to another place, if the last checkpoint cannot be written to its own.
+            least_seconds: Least time between two checkpoints.
         """
         self._save, self._rescue = save, rescue
         self.every, self.minutes = every, minutes
@@ -53,7 +113,7 @@ class Autosave:
         return time.monotonic() + 60 * self.minutes
 
     def __call__(self, report: StepReport) -> None:
-        """Saves if it is time to; where that fails, warns and tries again a minute later."""
+        """Saves if it is time to; if that fails, warns and tries again a minute later."""
         rested = time.monotonic() - self._saved_at >= self._least_seconds
         on_step = rested and report.falls_on(self.every)
         if report.skipped is not None or not (on_step or time.monotonic() >= self._due):
@@ -62,7 +122,7 @@ class Autosave:
             self.save(report.step)
         except UserError as error:
             self._due = time.monotonic() + RETRY_SECONDS
-            warnings.warn(f"{error} (training goes on and tries again)", WildGSWarning, stacklevel=2)
+            warnings.warn(f"{error} (training continues and tries again)", WildGSWarning, stacklevel=2)
 
     def save(self, step: int) -> None:
         """Saves now, unless this step is saved already.
@@ -77,11 +137,7 @@ class Autosave:
             self._due = self._next_time()
 
     def save_last(self, step: int, *, hurry: bool = False) -> None:
-        """Saves the last step: tries for a minute, then writes the state to another place.
-
-        Args:
-            step: Its number.
-            hurry: Try once only, since the process has been asked to end.
+        """Saves the last step: tries for a minute, or once where there is a hurry, then writes it to another place.
 
         Raises:
             UserError: It could not be written to the run folder; the message says where the state is.

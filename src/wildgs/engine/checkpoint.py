@@ -28,12 +28,7 @@ _TIMINGS = ("progress.seconds",)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A read checkpoint.
-
-    Attributes:
-        state: What `Trainer.state` gave.
-        header: What the caller stored beside it: JSON values.
-    """
+    """A checkpoint that was read: what `Trainer.state` gave, and the caller's header of JSON values."""
 
     state: dict[str, Tensor]
     header: dict[str, Any]
@@ -51,19 +46,13 @@ class Checkpoint:
 
 
 class DamagedCheckpointError(UserError):
-    """The content of a checkpoint is not what was written: cut short, or changed on the disk."""
+    """A checkpoint whose content is not what was written: truncated, or changed on the disk."""
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> Path:
     """Writes ``step_NNNNNNNN.safetensors`` atomically and flushed to the disk; the last two are kept.
 
-    Whatever stops this leaves the earlier checkpoints as they were.
-
-    Args:
-        folder: Created if it does not exist.
-        step: Names the file.
-        state: Flat tensors.
-        header: JSON values.
+    A failure leaves the earlier checkpoints as they were. The header holds JSON values.
 
     Raises:
         UserError: The disk is full, or the folder cannot be written to.
@@ -133,7 +122,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def load_header(path: Path) -> dict[str, Any]:
-    """The header of a checkpoint, without its tensors and without comparing the checksum; empty if unreadable."""
+    """The header of a checkpoint, without tensors and checksum; empty if it cannot be read."""
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("wildgs", "{}"))
@@ -166,11 +155,8 @@ def _checked_header(metadata: dict[str, str], state: dict[str, Tensor]) -> dict[
 def load_newest(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
     """The newest undamaged checkpoint, or None where there is no checkpoint at all.
 
-    Damaged ones are named in a warning, and the one before is read.
-
-    Args:
-        folder: Where `save_checkpoint` wrote.
-        set_aside: Whether to rename damaged ones, so that they do not count among the two that are kept.
+    A warning names damaged ones, and the one before is read. With `set_aside` they are renamed, so that they do
+    not count among the two that are kept.
 
     Raises:
         UserError: All checkpoints are damaged, or the newest cannot be read for another reason.

@@ -73,7 +73,7 @@ class DensityControl:
         return {"gradient_sum": self.gradient_sum, "seen": self.seen, "reach": self.reach}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Goes on where `state` was taken."""
+        """Continues where `state` was taken."""
         names = ("gradient_sum", "seen", "reach")
         self.gradient_sum, self.seen, self.reach = (state[name].to(self.device) for name in names)
 

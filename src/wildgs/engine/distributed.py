@@ -1,7 +1,7 @@
 """Training on several processes (ranks): `torchrun --nproc-per-node K -m wildgs train ...`.
 
-Every rank holds the whole model and takes another photo; gradients and screen statistics are pooled, and all that
-decides is the same everywhere, so the ranks stay identical to the bit. docs/scaling.md has the arithmetic.
+Every rank holds the whole model and trains on another photo. Gradients and screen statistics are summed over the
+ranks, and whatever decides is the same on all of them, so that they stay identical to the bit (docs/scaling.md).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import contextlib
 import os
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any, TypeVar
@@ -20,43 +20,105 @@ from torch import Tensor
 from torch import distributed as dist
 
 from wildgs import processes
-from wildgs.engine.collectives import raise_once, sum_over_ranks
 from wildgs.engine.density import ScreenStatistics
 from wildgs.engine.team import DivergedRanksError, LostRankError, Team
 from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.losses.objective import Losses
 from wildgs.threads import thread_count
 
+BUCKET_ELEMENTS = 1 << 22
+"""Smaller tensors are sent in buckets of at most about twice so many numbers: 16 MB saturate any network, and one
+message for each of a network's hundreds of small tensors would be bound by latency."""
+
+
+@torch.no_grad()
+def sum_over_ranks(tensors: Sequence[Tensor]) -> None:
+    """Replaces every tensor by its sum over all ranks; afterwards all ranks hold the same bits.
+
+    Large tensors are sent as they are, small ones in flat buckets, all asynchronously.
+
+    Args:
+        tensors: Of the same shapes in the same order on all ranks, in any memory layout; one dtype and device.
+    """
+    small = [tensor for tensor in tensors if tensor.numel() < BUCKET_ELEMENTS]
+    sent: list[tuple[list[Tensor], Tensor]] = []
+    for tensor in tensors:
+        if tensor.numel() >= BUCKET_ELEMENTS:
+            sent.append(([tensor], tensor if tensor.is_contiguous() else tensor.contiguous()))
+    for bucket in _buckets(small):
+        sent.append((bucket, torch.cat([tensor.reshape(-1) for tensor in bucket])))
+    waiting = [dist.all_reduce(flat, op=dist.ReduceOp.SUM, async_op=True) for _, flat in sent]
+    for work in waiting:
+        if work is not None:
+            work.wait()
+    for bucket, flat in sent:
+        if flat is not bucket[0]:
+            for tensor, part in zip(bucket, flat.split([t.numel() for t in bucket]), strict=True):
+                tensor.copy_(part.view(tensor.shape))
+
+
+def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    bucket: list[Tensor] = []
+    count = 0
+    for tensor in tensors:
+        bucket.append(tensor)
+        count += tensor.numel()
+        if count >= BUCKET_ELEMENTS:
+            yield bucket
+            bucket, count = [], 0
+    if bucket:
+        yield bucket
+
+
+def raise_once(messages: Sequence[str | None], rank: int, own: UserError | None = None) -> None:
+    """Ends all ranks if one of them failed, and reports the error once.
+
+    Args:
+        messages: The message of each rank's error, None for ranks without.
+        rank: Of this process.
+        own: The error of this rank.
+
+    Raises:
+        UserError: On rank 0: its own error, or the first other one with its rank.
+        ReportedError: On the other ranks.
+    """
+    failed = [other for other, message in enumerate(messages) if message is not None]
+    if not failed:
+        return
+    message = str(messages[failed[0]])
+    if rank:
+        raise ReportedError(message)
+    raise own if own is not None else UserError(f"rank {failed[0]}: {message}")
+
+
 Result = TypeVar("Result")
 
 TIMEOUT = timedelta(minutes=10)
-"""How long a rank waits for another one that is silent but whose connection stands: the first use of the CPU's
-kernels compiles for minutes, and a checkpoint on a slow disk takes its time."""
+"""How long a rank waits for one that does not answer while its connection is open: the first use of the CPU kernels
+compiles for minutes, and so does a checkpoint on a slow disk take."""
 
 
 class Ranks(Team):
     """One of several processes; `join` makes it."""
 
     def __init__(self, control: dist.ProcessGroup) -> None:
-        """Sets up a `Ranks`.
+        """Takes a gloo group of all ranks for messages between hosts.
 
-        Args:
-            control: A gloo group of all ranks, for what the host knows: it notices a lost rank at once, where
-                a GPU's collectives would wait for their timeout.
+        It reports a lost rank at once, where a GPU's collectives would wait for their timeout.
         """
         super().__init__()
         self.rank = dist.get_rank()
         self.size = dist.get_world_size()
         self._control = control
-        self._verdict = 0
+        self._stop_signal = 0
 
     @property
-    def verdict(self) -> int:
-        """The highest signal that any rank had received before the last exchange."""
-        return self._verdict
+    def stop_signal(self) -> int:
+        """The highest signal that any rank had received before the last step."""
+        return self._stop_signal
 
     @contextmanager
-    def together(self) -> Iterator[None]:  # noqa: D102 - as in Team
+    def propagate_errors(self) -> Iterator[None]:  # noqa: D102 - as in Team
         own: UserError | None = None
         with warnings.catch_warnings():
             if not self.first:
@@ -69,7 +131,7 @@ class Ranks(Team):
 
     def from_first(self, function: Callable[[], Result]) -> Result:  # noqa: D102 - as in Team
         result: list[Any] = [None]
-        with self.together():
+        with self.propagate_errors():
             if self.first:
                 result[0] = function()
         with _peers():
@@ -81,7 +143,7 @@ class Ranks(Team):
 
     def require_same(self, facts: Mapping[str, str]) -> None:  # noqa: D102 - as in Team
         gathered = self._gather(dict(facts))
-        with self.together():
+        with self.propagate_errors():
             for name, value in gathered[0].items():
                 others = [rank for rank, found in enumerate(gathered) if found.get(name) != value]
                 if others:
@@ -110,19 +172,19 @@ class Ranks(Team):
         return Losses(image=image, mask=mask, depth=depth, total=total)
 
     def _exchange_control(self, parameters: list[Tensor]) -> None:
-        """One small message ahead of the gradients: who has which, whether sizes agree, whether to stop."""
+        """One small message ahead of the gradients: who has which, whether sizes agree and to stop."""
         count = sum(parameter.numel() for parameter in parameters)
         present = [int(parameter.grad is not None) for parameter in parameters]
-        message = torch.tensor([self.wish, count, -count, *present])
+        state = torch.tensor([self.received_signal, count, -count, *present])
         with _peers():
-            dist.all_reduce(message, op=dist.ReduceOp.MAX, group=self._control)
-        self._verdict, most, least, *present = message.tolist()
+            dist.all_reduce(state, op=dist.ReduceOp.MAX, group=self._control)
+        self._stop_signal, most, least, *present = state.tolist()
         if most != -least:
-            said = (
-                f"the ranks' models differ in size ({-least:,} and {most:,} numbers); --resume goes on from the "
+            message = (
+                f"the ranks' models differ in size ({-least:,} and {most:,} numbers); --resume continues from the "
                 "newest checkpoint, which all ranks take from rank 0"
             )
-            raise DivergedRanksError(said) if self.first else ReportedError(said)
+            raise DivergedRanksError(message) if self.first else ReportedError(message)
         for parameter, somewhere in zip(parameters, present, strict=True):
             if somewhere and parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
@@ -144,12 +206,7 @@ class Ranks(Team):
 
 @contextmanager
 def _peers() -> Iterator[None]:
-    """Turns a broken connection into one line, told by the rank that notices first.
-
-    Raises:
-        LostRankError: On that rank.
-        ReportedError: On those that notice later.
-    """
+    """Turns a broken connection into `LostRankError` on the first rank that notices, `ReportedError` on others."""
     try:
         yield
     except torch.OutOfMemoryError:
@@ -158,14 +215,14 @@ def _peers() -> Iterator[None]:
         reason = (str(error).splitlines() or [""])[0]
         message = (
             "another process of this training ended or does not answer, so all of them stop (torchrun says below "
-            "which one failed first); the same command with --resume goes on from the newest checkpoint, with any "
-            f"number of processes. The connection said: {reason}"
+            "which one failed first); the same command with --resume continues from the newest checkpoint, with "
+            f"any number of processes. The connection said: {reason}"
         )
         raise (LostRankError(message) if _notices_first() else ReportedError(message)) from error
 
 
 def _notices_first() -> bool:
-    """Asks the store, which torchrun itself keeps: it outlives any rank."""
+    """By a counter in torchrun's store, which outlives all ranks."""
     try:
         return dist.distributed_c10d._get_default_store().add("wildgs/lost", 1) == 1
     except RuntimeError:
@@ -174,7 +231,7 @@ def _notices_first() -> bool:
 
 @contextmanager
 def join() -> Iterator[Team]:
-    """Joins the processes that torchrun started; without it, a team of one.
+    """Connects the processes that torchrun started; without torchrun, a team of one.
 
     Raises:
         UserError: There are more processes than GPUs, or no connection.
@@ -184,7 +241,7 @@ def join() -> Iterator[Team]:
         return
     # A library's handler would print a page of stack where torchrun ends those that are left.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    device = settle()
+    device = assign_device()
     try:
         if device.type == "cuda":
             dist.init_process_group("nccl", timeout=TIMEOUT, device_id=device)
@@ -209,8 +266,8 @@ def join() -> Iterator[Team]:
                 dist.destroy_process_group()
 
 
-def settle() -> torch.device:
-    """Gives this one of torchrun's processes its own GPU, or its part of the machine's cores.
+def assign_device() -> torch.device:
+    """Assigns this process its own GPU, or its share of the machine's cores.
 
     Raises:
         UserError: There are more processes than GPUs.

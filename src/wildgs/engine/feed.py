@@ -1,4 +1,4 @@
-"""What a step trains on: the next photo that can be read, and what belongs to it, on the device."""
+"""What a step trains on: photos in shuffled rounds, and what belongs to each, on the device."""
 
 from __future__ import annotations
 
@@ -9,13 +9,57 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.team import Team
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene import View
 from wildgs.scene.image_cache import AHEAD
 from wildgs.scene.scene import upload
+
+
+class ViewSampler:
+    """Endless shuffled rounds over `count` views, with a state that can be saved."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        self.count = count
+        self._generator = generator
+        self.order = torch.empty(0, dtype=torch.int64)
+        self.position = 0
+
+    def next(self) -> int:
+        """The index of the next view."""
+        return self.take(1)[0]
+
+    def take(self, count: int) -> list[int]:
+        """Indices of the next `count` views, all different; at most as many as there are views."""
+        taken = self.upcoming(count)
+        self.position += len(taken)
+        missing = count - len(taken)
+        if missing:
+            order = torch.randperm(self.count, generator=self._generator)
+            if taken:  # a round may not begin with the photos that end the one before, in the same step
+                repeated = torch.isin(order, torch.tensor(taken))
+                fresh = order[~repeated]
+                order = torch.cat([fresh[:missing], order[repeated], fresh[missing:]])
+            self.order = order
+            self.position = missing
+            taken += order[:missing].tolist()
+        return taken
+
+    def upcoming(self, count: int) -> list[int]:
+        """Indices of the next views, as far as this round has been drawn."""
+        return self.order[self.position : self.position + count].tolist()
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs."""
+        return {"order": self.order.clone(), "position": torch.tensor(self.position)}
+
+    def restore(self, state: dict[str, Tensor]) -> bool:
+        """Continues from `state`; whether in the same order, since another number of photos is shuffled again."""
+        same = len(state["order"]) in (0, self.count)
+        self.order = state["order"] if same else torch.empty(0, dtype=torch.int64)
+        self.position = int(state["position"]) if same else 0
+        return same
 
 
 class PhotoFeed:
@@ -43,7 +87,7 @@ class PhotoFeed:
         self._cameras: dict[str, Camera] = {}
 
     def next_view(self) -> View:
-        """The next photo that can be read; those after it are decoded in the background meanwhile.
+        """The next photo that can be read, while those after it are decoded in the background.
 
         Raises:
             UserError: None can be read any more.
@@ -57,7 +101,7 @@ class PhotoFeed:
         )
 
     def _candidates(self) -> Iterator[int]:
-        """This rank's next photo, then others in its place; what all ranks share moves on alike in any case."""
+        """This rank's next photo, then replacements for it; the sampler advances equally on all ranks."""
         size, rank = self.team.size, self.team.rank
         for _ in range(len(self.views)):
             batch = self.sampler.take(size)
@@ -77,7 +121,7 @@ class PhotoFeed:
         except UserError as error:
             if view.name not in self._unreadable:
                 self._unreadable.add(view.name)
-                warnings.warn(f"{error} (training goes on without it)", WildGSWarning, stacklevel=3)
+                warnings.warn(f"{error} (training continues without it)", WildGSWarning, stacklevel=3)
             return False
         return True
 

@@ -1,53 +1,20 @@
-"""How much memory a training will take, before it takes it.
+"""Bounds the number of Gaussians by the memory that is free before training.
 
-Methods declare what they use (`wildgs.model.method.MemoryUse`); `benchmarks/memory.py` measures it as the peak
+Methods declare what they use (`wildgs.model.config.MemoryUse`); `benchmarks/memory.py` measures it as the peak
 resident memory of short trainings that differ in one size. Decoded photos have a limit of their own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 
 from wildgs.errors import UserError
-from wildgs.model.method import MemoryUse
 from wildgs.model.registry import MethodName, method_type
 from wildgs.scene import Scene
 from wildgs.scene.image_cache import available_memory
 
 MARGIN = 0.9
 """Share of the free memory that may be planned with."""
-
-
-@dataclass(frozen=True)
-class MemoryEstimate:
-    """What training takes beside the decoded photos, bytes.
-
-    Attributes:
-        use: What the method declares.
-        num_gaussians: Upper bound on their number.
-        pixels: Of the largest photo, at the size at which it trains.
-    """
-
-    use: MemoryUse
-    num_gaussians: int
-    pixels: int
-
-    @property
-    def gaussians(self) -> int:
-        """What the Gaussians take of it."""
-        return self.num_gaussians * self.use.per_gaussian
-
-    @property
-    def total(self) -> int:
-        """In all."""
-        return self.use.fixed + self.pixels * self.use.per_pixel + self.gaussians
-
-    def largest_budget(self, available: int) -> int:
-        """The most Gaussians for which `available` bytes suffice; below 0 where nothing does."""
-        rest = int(MARGIN * available) - (self.total - self.gaussians)
-        return rest // self.use.per_gaussian
 
 
 def free_memory(device: torch.device) -> int | None:
@@ -63,8 +30,8 @@ def plan_budget(
     """A budget of Gaussians that fits, decided before training starts.
 
     Args:
-        method: What will be trained.
-        scene: Its photos are read already.
+        method: Name of the method.
+        scene: The scene, whose photos have been read.
         budget: Upper bound on the number of Gaussians, as configured.
         device: Where training will run.
         explicit: Whether the user gave this budget: then it is never lowered.
@@ -73,16 +40,17 @@ def plan_budget(
         The budget, and a message for the user where it was lowered.
 
     Raises:
-        UserError: The scene, or the budget that was asked for, cannot fit.
+        UserError: The scene, or an explicit budget, does not fit.
     """
     pixels = max(view.camera.width * view.camera.height for view in scene.views)
-    estimate = MemoryEstimate(method_type(method).memory, budget, pixels)
-    available = free_memory(device)
-    if available is None or estimate.total <= MARGIN * available:
+    use, available = method_type(method).memory, free_memory(device)
+    rest = use.fixed + pixels * use.per_pixel
+    total = rest + budget * use.per_gaussian
+    if available is None or total <= MARGIN * available:
         return budget, None
-    fits = estimate.largest_budget(available)
+    fits = (int(MARGIN * available) - rest) // use.per_gaussian
     size = f"{pixels / 1e6:.1f} megapixels"
-    needs = f"{budget:,} Gaussians on photos of {size} take about {gigabytes(estimate.total)}"
+    needs = f"{budget:,} Gaussians on photos of {size} take about {gigabytes(total)}"
     least = min(budget, len(scene.points))
     if fits < least:
         raise UserError(

@@ -53,8 +53,8 @@ class Optimizers:
         """Optimisers for a method.
 
         Args:
-            method: Whose parameters are optimised.
-            config: Learning rates.
+            method: The method.
+            config: Learning rates of the geometry.
             extent: Radius of the cameras' region, world units (3DGS's spatial learning rate scale).
             photos: Photos in the mean gradient of one step.
         """
@@ -83,7 +83,7 @@ class Optimizers:
         return self.photos**0.5 if self.config.batch_scaling == "sqrt" else 1.0
 
     def set_progress(self, progress: float) -> None:
-        """Moves every learning rate to where it belongs at a share of the run in [0, 1]."""
+        """Sets every learning rate for a share of the run in [0, 1]."""
         for optimizer, rates in ((self.rows, self.row_rates), (self.networks, self.network_rates)):
             for group in [] if optimizer is None else optimizer.param_groups:
                 chosen = rates[group["name"]]
@@ -104,7 +104,7 @@ class Optimizers:
     def state(self) -> dict[str, Tensor]:
         """Adam's moments and step counts, as flat tensors.
 
-        Steps are counted in photos, so that training may go on with another number of photos a step.
+        Steps are counted in photos, so that training may continue with another number of photos a step.
         """
         return {
             f"{kind}.{index}.{key}": value * self.photos if key == "step" else value

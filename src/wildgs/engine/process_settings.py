@@ -1,4 +1,4 @@
-"""What training changes in the process that runs it, for as long as it runs."""
+"""Process-wide settings that training changes while it runs, and puts back."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ _DEFAULT_BYTES = 128 * 2**10  # of both
 
 
 class ProcessSettings:
-    """Settings of the process and states of torch's global random generators that belong to one training.
+    """Settings of the process and states of torch's random generators, in effect between `begin` and `end`.
 
-    Between `begin` and `end` they are in force; before and after it the process has its own. The generators'
-    states are taken when this is made, so that a seed set before the method was made holds for training too.
+    The generators' states are taken when this is created, so that a seed set before also holds for training.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -29,7 +28,7 @@ class ProcessSettings:
         self._undo: ExitStack | None = None
 
     def begin(self) -> None:
-        """Puts the training's settings into force; does nothing where they are."""
+        """Applies the training's settings, unless they are applied already."""
         if self._undo is not None:
             return
         undo = ExitStack()
@@ -45,7 +44,7 @@ class ProcessSettings:
         self._undo = undo
 
     def end(self) -> None:
-        """Puts back what was there before `begin`."""
+        """Restores what was set before `begin`."""
         if self._undo is not None:
             self._random = _random_states(self.device)
             self._undo.close()
@@ -56,7 +55,7 @@ class ProcessSettings:
         return self._random if self._undo is None else _random_states(self.device)
 
     def set_random_states(self, states: dict[str, Tensor]) -> None:
-        """Continues from what `random_states` gave, on whatever device."""
+        """Continues from the states that `random_states` gave, possibly on another device."""
         self._random = self._random | {name: states[name] for name in self._random if name in states}
         if self._undo is not None:
             _set_random_states(self.device, self._random)
@@ -80,10 +79,7 @@ def _flushes_denormals() -> bool:
 
 
 def _keep_freed_memory(keep: bool) -> None:
-    """Has malloc keep memory that a step frees for the next one (glibc; other allocators keep it anyway).
-
-    Handing every large tensor back to the system costs a page fault per 4 KiB, step after step.
-    """
+    """Makes glibc's malloc keep freed memory: returning it costs a page fault per 4 KiB in every step."""
     if sys.platform != "linux":
         return
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

@@ -1,4 +1,4 @@
-"""What a run leaves on disk while it trains: metrics.jsonl and tensorboard."""
+"""Records of a training: metrics.jsonl and TensorBoard."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Recorder:
     def __init__(
         self, folder: Path, *, scalars_every: int = 50, pictures_every: int = 500, step: int = 0
     ) -> None:
-        """Sets up a `Recorder`.
+        """Opens the records in a run folder.
 
         Args:
             folder: The run folder.
             scalars_every: Steps between log entries.
-            pictures_every: Steps between pictures on tensorboard.
-            step: Where the run stands; what an earlier, killed process recorded beyond it is dropped.
+            pictures_every: Steps between pictures on TensorBoard.
+            step: Steps done; later records of an earlier process are dropped.
 
         Raises:
             UserError: The folder cannot be written to.
@@ -67,7 +67,7 @@ class Recorder:
                 file.close()
 
     def __call__(self, report: StepReport) -> None:
-        """Records a step, if it is one to be recorded; a disk that refuses ends the records, not the training."""
+        """Records a step where its turn has come; if the disk fails, training continues without records."""
         try:
             if report.falls_on(self.scalars_every) or report.skipped is not None:
                 self._record_scalars(report)
@@ -76,7 +76,7 @@ class Recorder:
         except OSError as error:
             if not self._failed:
                 warnings.warn(
-                    f"metrics.jsonl and tensorboard cannot be written ({error}); training goes on",
+                    f"metrics.jsonl and tensorboard cannot be written ({error}); training continues",
                     WildGSWarning,
                     stacklevel=2,
                 )
@@ -118,7 +118,7 @@ def _grey(depth: Tensor) -> Tensor:
 
 
 def _keep_until(lines: Path, step: int) -> None:
-    """Drops records of steps that a resumed run will take again, and a line that was cut off."""
+    """Drops records of steps that a resumed run repeats, and truncated lines."""
     if not lines.is_file():
         return
     kept = []

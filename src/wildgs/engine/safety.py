@@ -1,7 +1,8 @@
-"""Steps whose loss or gradient is not finite: they are not taken, and end the run where they do not stop."""
+"""Skips steps with a non-finite loss or gradient, and ends a run in which they do not stop."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ PATIENCE = 10
 
 
 class TrainingDivergedError(UserError):
-    """The loss or its gradient was not finite for `PATIENCE` steps in a row."""
+    """The loss or its gradient was non-finite for `PATIENCE` steps in a row."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class _Mark:
 
 
 class StepGuard:
-    """Judges every step before the optimisers take it.
+    """Checks every step before the optimisers take it.
 
     Attributes:
-        in_a_row: Steps not taken since the last good one.
+        in_a_row: Steps skipped since the last one taken.
     """
 
     def __init__(self) -> None:
@@ -82,7 +83,7 @@ class StepGuard:
         return self._count(photo, faulty, losses.as_floats() if faulty else {})
 
     def mark(self, step: int, photo: str, losses: Losses, parameters: Iterable[Tensor]) -> Float[Tensor, ""]:
-        """As `judge`, but the host does not wait: after the next step's forward pass, `settle` says what came out.
+        """As `judge`, but the host does not wait: `judge_marked` says the result after the next forward pass.
 
         Args:
             step: Its number.
@@ -102,7 +103,7 @@ class StepGuard:
         self._mark = _Mark(step, photo, numbers, arrived)
         return faulty
 
-    def settle(self) -> tuple[int, str] | None:
+    def judge_marked(self) -> tuple[int, str] | None:
         """Judges the step that was marked last: its number and what is not finite; None where nothing is wrong."""
         mark, self._mark = self._mark, None
         if mark is None:
@@ -119,7 +120,7 @@ class StepGuard:
         self._skipped += 1
         self.in_a_row += 1
         self._photos.append(photo)
-        wrong = [name for name, value in terms.items() if not _finite(value)]
+        wrong = [name for name, value in terms.items() if not math.isfinite(value)]
         return f"loss term {wrong[0]}" if wrong else "gradient"
 
     def report(self, step: int, fault: str, method: nn.Module) -> None:
@@ -131,14 +132,14 @@ class StepGuard:
             method: Searched for parameters that are not finite, where the run has to end.
 
         Raises:
-            TrainingDivergedError: It was one too many in a row.
+            TrainingDivergedError: `PATIENCE` steps in a row were skipped.
         """
         photo = self._photos[-1]
         if self.in_a_row >= PATIENCE:
             raise TrainingDivergedError(_diagnosis(step, fault, self._photos, method))
         if self.in_a_row == 1 or self.skipped <= PATIENCE:
             warnings.warn(
-                f"step {step}, photo {photo}: the {fault} is not finite; the step is skipped "
+                f"step {step}, photo {photo}: the {fault} is non-finite; the step is skipped "
                 f"({self.skipped} so far)",
                 WildGSWarning,
                 stacklevel=2,
@@ -156,17 +157,13 @@ def _diagnosis(step: int, fault: str, photos: list[str], method: nn.Module) -> s
     broken = [name for name, value in method.named_parameters() if not bool(torch.isfinite(value).all())]
     names = sorted(set(photos))
     if broken:
-        cause = f"the parameters {', '.join(broken[:3])} hold values that are not finite"
+        cause = f"the parameters {', '.join(broken[:3])} hold non-finite values"
     elif len(names) == 1:
         cause = f"all of them on the photo {names[0]}; look at it and its camera, or take it out of the scene"
     else:
-        cause = f"on {len(names)} photos ({', '.join(names[:3])}, ...), with parameters that are sound"
+        cause = f"on {len(names)} photos ({', '.join(names[:3])}, ...), with finite parameters"
     return (
-        f"training diverged at step {step}: {PATIENCE} steps in a row had no finite {fault}: {cause}. "
-        "The newest checkpoint is from before; --resume goes on from it, and lower learning rates "
+        f"training diverged at step {step}: {PATIENCE} steps in a row had a non-finite {fault}: {cause}. "
+        "The newest checkpoint was saved before; --resume continues from it, and lower learning rates "
         "(--optimizer.*) in a new run may help"
     )
-
-
-def _finite(value: float) -> bool:
-    return value - value == 0

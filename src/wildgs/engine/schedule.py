@@ -1,9 +1,9 @@
-"""What happens when: every schedule of training as a function of the step, nothing else."""
+"""Training schedules as functions of the step."""
 
 from __future__ import annotations
 
 from wildgs.engine.config import ScheduleConfig
-from wildgs.model.method import Stage
+from wildgs.model.training_pass import Stage
 
 REFERENCE_STEPS = 30_000
 """The paper's training length; schedules below are stated for it and scale with the run's own length."""
@@ -17,7 +17,7 @@ _FLOORS = {
     "mask_pause": 100,
     "sh_every": 100,
 }
-"""Least steps in a short run: a mask needs so many to become useful, whatever the run's length."""
+"""Least steps in a short run: a mask, for example, needs so many to become useful whatever the run's length."""
 _FLOOR_SHARE = 5
 """A floor takes at most this part (one in five) of a run."""
 
@@ -26,12 +26,7 @@ class Schedule:
     """The schedules of one run."""
 
     def __init__(self, config: ScheduleConfig, steps: int) -> None:
-        """Sets up a `Schedule`.
-
-        Args:
-            config: In the paper's steps.
-            steps: The run's own length.
-        """
+        """Scales a configuration in the paper's steps to a run of `steps`."""
         self.steps = steps
         self.encoder_every = config.encoder_every
         self._factor = steps / REFERENCE_STEPS
@@ -58,13 +53,7 @@ class Schedule:
         return min(step / max(self.steps - 1, 1), 1.0)
 
     def stage(self, step: int, sh_degree: int, taken: int = 1) -> Stage:
-        """What the method's forward pass does at a step.
-
-        Args:
-            step: From 0.
-            sh_degree: The method's full degree.
-            taken: For how many steps this one will count.
-        """
+        """The stage at a step (from 0) that counts for `taken` steps; `sh_degree` is the method's full degree."""
         return Stage(
             explicit=step >= self.first_stage,
             learn_mask=not self.mask_paused(step),
@@ -100,5 +89,5 @@ def falls_on(step: int, taken: int, every: int) -> bool:
 
 
 def exponential(start: float, end: float, progress: float) -> float:
-    """From `start` to `end` on a straight line of logarithms (3DGS's position learning rate)."""
+    """Log-linear interpolation from `start` to `end` (3DGS's position learning rate)."""
     return start ** (1 - progress) * end**progress

@@ -1,4 +1,4 @@
-"""What the trainer knows of the other processes that train the same model (see `distributed`)."""
+"""The processes that train one model, as the trainer sees them; `distributed` has the one for several processes."""
 
 from __future__ import annotations
 
@@ -29,49 +29,44 @@ class DivergedRanksError(UserError):
 
 
 class Team:
-    """The processes that train one model, as one of them sees it. This class: one process alone.
+    """The processes (ranks) that train one model, as one of them sees it; this class is a single process.
 
     Attributes:
         rank: This process, from 0.
         size: How many there are.
-        wish: The signal by which this process was asked to stop, 0 for none; carried to all with the next step.
+        received_signal: Signal that asked this process to stop, 0 for none; sent to all ranks in the next step.
     """
 
     rank: int = 0
     size: int = 1
 
     def __init__(self) -> None:
-        self.wish = 0
+        self.received_signal = 0
 
     @property
     def first(self) -> bool:
-        """Whether this process writes files and talks to the user."""
+        """Whether this is rank 0, which alone writes files and prints."""
         return self.rank == 0
 
     @property
-    def verdict(self) -> int:
-        """The signal by which all are to stop after this step, 0 for none; the same on all ranks."""
-        return self.wish
+    def stop_signal(self) -> int:
+        """The signal for which all ranks stop after this step, 0 for none; the same on all ranks."""
+        return self.received_signal
 
     @contextmanager
-    def together(self) -> Iterator[None]:
-        """A block that all ranks run alike: warnings come from rank 0, and one rank's mistake ends all.
+    def propagate_errors(self) -> Iterator[None]:
+        """Runs a block on all ranks: rank 0 alone warns, and a `UserError` on any rank ends all of them.
 
-        Inside it there may be no exchange between ranks.
+        The block must not communicate between ranks.
 
         Raises:
-            UserError: On rank 0: what went wrong, on which rank.
+            UserError: On rank 0, with the number of the rank that failed.
             ReportedError: On the other ranks.
         """
         yield
 
     def from_first(self, function: Callable[[], Result]) -> Result:
-        """What a function returns on rank 0, where alone it is called.
-
-        Raises:
-            UserError: The function did, on rank 0.
-            ReportedError: On the other ranks then.
-        """
+        """Calls a function on rank 0 alone and gives its result to all ranks; errors as in `propagate_errors`."""
         return function()
 
     def least(self, value: int) -> int:
@@ -79,11 +74,7 @@ class Team:
         return value
 
     def require_same(self, facts: Mapping[str, str]) -> None:
-        """Compares facts that have to be the same on all ranks.
-
-        Raises:
-            UserError: Some are not.
-        """
+        """Raises `UserError` if the ranks differ in one of these facts."""
 
     def share(self, tensors: Iterable[Tensor]) -> None:
         """Gives rank 0's values to all ranks, in place."""
@@ -111,14 +102,7 @@ class Team:
 def same_everywhere(
     method: Method, views: Sequence[View], config: object, precision: torch.dtype
 ) -> dict[str, str]:
-    """What has to be the same on all ranks before they begin, for `Team.require_same`.
-
-    Args:
-        method: What is trained.
-        views: The photos that train.
-        config: Of the training.
-        precision: Of the networks.
-    """
+    """What must be the same on all ranks before training begins, for `Team.require_same`."""
     shapes = {name: tuple(value.shape) for name, value in method.state_dict().items()}
     return {
         "version of wildgs": __version__,

@@ -1,4 +1,4 @@
-"""The training loop. It knows no screen and no file: observers watch it, and `state` is all there is to save."""
+"""The training loop. It prints and writes nothing: observers watch it, and `state` is what a checkpoint holds."""
 
 from __future__ import annotations
 
@@ -14,24 +14,23 @@ from torch import Tensor
 from wildgs import features
 from wildgs.engine.config import TrainConfig
 from wildgs.engine.density import DensityControl, DensityReport
-from wildgs.engine.feed import PhotoFeed
+from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.safety import StepGuard
-from wildgs.engine.sampler import ViewSampler
 from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
-from wildgs.model.feature_cache import FeatureCache
-from wildgs.model.method import Method, SeenPhoto, TrainingOutput
-from wildgs.model.parsing import keep_features
+from wildgs.model.method import Method
+from wildgs.model.parsing import FeatureCache, keep_features
 from wildgs.model.precision import (
     choose_precision,
     lay_out_channels_last,
     set_precision,
     switch_replays,
 )
+from wildgs.model.training_pass import SeenPhoto, TrainingOutput
 from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
 from wildgs.scene.scene import observed_pixels
@@ -91,16 +90,16 @@ class Trainer:
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
-        """Sets up a `Trainer`.
+        """Prepares training at step 0.
 
         Args:
-            method: Trained in place, on the device on which its parameters are.
+            method: Trained in place, on the device of its parameters.
             scene: The photos; nothing of it under `truth/` is read.
-            config: How.
-            team: The processes that train this model together; by default this one alone.
+            config: Training options.
+            team: The processes that train this model; by default this one alone.
 
         Raises:
-            UserError: There is no photo to train on, or there are fewer than processes.
+            UserError: There is no photo to train on, or there are fewer photos than processes.
         """
         self.views = scene.train_views
         self.team = team or Team()
@@ -141,7 +140,7 @@ class Trainer:
             while self.step < self.config.steps:
                 report = self.advance()
                 if self.step >= self.config.steps:
-                    self._settle()
+                    self._report_marked()
                     self._finish()
                 for observer in observers:
                     observer(report)
@@ -149,7 +148,7 @@ class Trainer:
             self.end()
 
     def begin(self) -> None:
-        """Gets the method and this process ready for `advance`; `run` calls it. `end` undoes it.
+        """Prepares the method and this process for `advance`; `run` calls it. `end` undoes it.
 
         Raises:
             UserError: The ranks cannot train one model: their photos, models or versions differ.
@@ -158,7 +157,7 @@ class Trainer:
         precision = choose_precision(self.config.precision, self.device)
         self.team.require_same(same_everywhere(self.method, self.views, self.config, precision))
         if self.step == 0:
-            with self.team.together():
+            with self.team.propagate_errors():
                 self._prepare()
         self.team.share(self.method.state_dict().values())
         set_precision(self.method, precision)
@@ -166,7 +165,7 @@ class Trainer:
         keep_features(self.method, FeatureCache(self.feature_cache))
 
     def end(self) -> None:
-        """Undoes `begin`: the method in float32 without graphs, the process's settings as they were before."""
+        """Undoes `begin`: float32, no CUDA graphs, and the process's settings as they were before."""
         set_precision(self.method, torch.float32)
         switch_replays(self.method, False)
         keep_features(self.method, None)
@@ -178,7 +177,7 @@ class Trainer:
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         output, losses = self._forward(view)
-        skipped = self._settle()
+        skipped = self._report_marked()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
         skipped = self._take(output, losses) or skipped
@@ -216,16 +215,16 @@ class Trainer:
             self.optimizers.step()
         else:
             self.method.zero_grad(set_to_none=True)
-            with self.team.together():
+            with self.team.propagate_errors():
                 self.guard.report(self.step + 1, fault, self.method)
         return fault
 
-    def _settle(self) -> str | None:
+    def _report_marked(self) -> str | None:
         """Reports the step before where it was skipped by the GPU, which has finished it by now; why it was."""
-        found = self.guard.settle()
+        found = self.guard.judge_marked()
         if found is None:
             return None
-        with self.team.together():
+        with self.team.propagate_errors():
             self.guard.report(*found, self.method)
         return found[1]
 
@@ -268,7 +267,7 @@ class Trainer:
         return report
 
     def shrink_to_budget(self) -> int:
-        """Drops Gaussians beyond `density.max_gaussians`, which was lowered since; how many."""
+        """Drops Gaussians beyond `density.max_gaussians`, where that was lowered since; returns how many."""
         budget = self.config.density.max_gaussians
         excess = self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
         if excess:
@@ -297,7 +296,7 @@ class Trainer:
         return SeenPhoto(photo, self.feed.camera(view), keep, view.name)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that training needs to go on exactly, as flat tensors."""
+        """Everything that training needs to continue exactly, as flat tensors."""
         state = {f"method.{name}": value for name, value in self.method.state_dict().items()}
         state |= {f"optimizer.{name}": value for name, value in self.optimizers.state().items()}
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
@@ -310,11 +309,11 @@ class Trainer:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Goes on from `state`; the method must have been restored from the same checkpoint already."""
+        """Continues from `state`; the method must have been restored from the same checkpoint already."""
         self.optimizers.restore(_under(state, "optimizer."))
         if not self.sampler.restore(_under(state, "sampler.")):
             message = f"the run began with other photos than the {len(self.views)} that train now"
-            warnings.warn(f"{message}; it goes on with these", WildGSWarning, stacklevel=2)
+            warnings.warn(f"{message}; it continues with these", WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         self._process.set_random_states(_under(state, "random."))

@@ -21,7 +21,6 @@ from wildgs.errors import UserError
 from wildgs.evaluation.metrics import MAX_PSNR
 from wildgs.evaluation.pictures import write_json
 from wildgs.model.method import Method
-from wildgs.model.rows import paint_visible
 from wildgs.rasterize import blend
 from wildgs.scene.scene import Scene, View, observed_pixels
 
@@ -132,7 +131,7 @@ def _inspect(method: Method, view: View, observed: Float[Tensor, "K 2"] | None) 
     pictures = torch.cat([photo, shown[..., None]], dim=2).permute(2, 0, 1)[None]
     small = functional.interpolate(pictures, (height, width), mode="bilinear", antialias=True)[0]
     projection = method.gaussians.project(view.camera.resized(width, height).to(device))
-    colors = blend(projection, paint_visible(method, projection, appearance, method.sh_degree)).colors
+    colors = blend(projection, method.paint(projection, appearance, method.sh_degree)).colors
     error = (colors.nan_to_num().clamp(0, 1).permute(2, 0, 1) - small[:3]).square().mean(dim=0)
     weights, psnr, structure = small[3], None, 0.0
     if float(weights.mean()) >= LEAST_SHOWN:
@@ -250,5 +249,10 @@ def read_photos(folder: Path, step: int) -> list[PhotoFit] | None:
     try:
         content = json.loads((folder / PHOTOS_FILE).read_text(encoding="utf-8"))
         return [PhotoFit(**photo) for photo in content["photos"]] if content["step"] == step else None
-    except (OSError, ValueError, TypeError, KeyError):  # absent, of another version, or cut off: found anew
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+    ):  # absent, of another version, or cut off: computed again
         return None

@@ -26,16 +26,11 @@ _SPZ_HALF_RANGE = 2**23
 
 
 def write_splats(file: Path, splats: Splats, kind: SplatFormat) -> None:
-    """Writes Gaussians to a file.
+    """Writes Gaussians, in the frame of the file, to a file; missing folders are created.
 
     `ply` is lossless. The others quantise, and `splat` keeps harmonics of degree 0 only. The axes of the Gaussians
     are kept; COLMAP and 3DGS programs read them as x right, y down, z forward. Only `spz`, which specifies x right,
     y up, z backward, is rotated by 180 degrees about x.
-
-    Args:
-        file: File to write; missing folders are created.
-        splats: Gaussians in the frame of the file.
-        kind: File format.
 
     Raises:
         UserError: The format needs a package that is not installed, or the package fails.

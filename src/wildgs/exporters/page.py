@@ -52,12 +52,7 @@ class PageLight:
 
 @dataclass(frozen=True)
 class PageView:
-    """Initial view of the page.
-
-    Attributes:
-        camera: Camera in the aligned frame of the scene (+z up).
-        depth: Depth of the centre of orbiting, world units.
-    """
+    """Initial view of the page: a camera in the aligned frame (+z up), and the depth of the centre of orbiting."""
 
     camera: Camera
     depth: float

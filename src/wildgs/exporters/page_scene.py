@@ -32,12 +32,7 @@ Planes = list[tuple[str, UInt8[np.ndarray, "C N"]]]
 
 @dataclass(frozen=True)
 class PackedScene:
-    """Encoded scene.
-
-    Attributes:
-        header: Counts and ranges, for JSON.
-        data: All planes, compressed by gzip.
-    """
+    """Encoded scene: counts and ranges for a JSON header, and all planes, compressed by gzip."""
 
     header: dict[str, Any]
     data: bytes

@@ -1,15 +1,27 @@
-"""Gaussians for export, as plain arrays that do not depend on the method."""
+"""Gaussians for export, as plain arrays that do not depend on the method, and what dropping some of them costs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from wildgs.geometry.rotation import rotations_to_quats
-from wildgs.geometry.spherical_harmonics import rotate_sh, sh_degree
+from wildgs.exporters.config import CleanupConfig
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.spherical_harmonics import (
+    fit_truncation,
+    num_sh_bases,
+    rotate_sh,
+    sh_degree,
+    truncate_sh,
+)
+from wildgs.model.gaussians import NEAR
+from wildgs.model.triplane import robust_box
+from wildgs.rasterize import rasterize
 from wildgs.scene.scene import Alignment
 
 
@@ -50,30 +62,76 @@ class Splats:
         return replace(self, sh=sh)
 
     def to_input_frame(self, alignment: Alignment) -> Splats:
-        """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale.
-
-        Args:
-            alignment: Transform from the frame of the input to that of the Gaussians.
-        """
+        """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale."""
         back = alignment.inverse()
         rotated = self.rotated(back.rotation)
         return replace(rotated, means=back.apply_points(self.means), scales=self.scales * back.scale)
 
     def rotated(self, rotation: Float[Tensor, "3 3"]) -> Splats:
         """The Gaussians after a rotation of the world about its origin, including their harmonics."""
-        turn = rotations_to_quats(rotation[None]).to(self.quats)
+        turn = Rotation.from_matrix(rotation.double().cpu().numpy())
+        turned = (turn * Rotation.from_quat(self.quats.double().cpu().numpy(), scalar_first=True)).as_quat(
+            scalar_first=True
+        )
         return Splats(
             means=self.means @ rotation.to(self.means).T,
-            quats=_multiply(turn, torch.nn.functional.normalize(self.quats, dim=1)),
+            quats=torch.from_numpy(turned).to(self.quats),
             scales=self.scales,
             opacities=self.opacities,
             sh=rotate_sh(self.sh, rotation),
         )
 
 
-def _multiply(first: Float[Tensor, "_ 4"], second: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
-    """Hamilton product of quaternions (w, x, y, z): `second` rotated by `first`."""
-    a, v = first[:, :1], first[:, 1:].expand(len(second), 3)
-    b, u = second[:, :1], second[:, 1:]
-    real = a * b - (v * u).sum(dim=1, keepdim=True)
-    return torch.cat([real, a * u + b * v + torch.linalg.cross(v, u)], dim=1)
+BOX_QUANTILE = 0.02
+"""Share of the SfM points outside the crop box, on each side of each axis."""
+
+
+def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:
+    """Mask of the Gaussians (aligned frame) that are kept; `points` are the SfM points in the same frame."""
+    keep = splats.opacities >= config.min_opacity
+    if config.max_distance is not None:
+        middle = points.median(dim=0).values.to(splats.means)
+        keep &= (splats.means - middle).norm(dim=1) <= config.max_distance
+    if config.crop is not None:
+        box = robust_box(points, BOX_QUANTILE, config.crop)
+        low, high = box.low.to(splats.means), box.high.to(splats.means)
+        keep &= ((splats.means >= low) & (splats.means <= high)).all(dim=1)
+    return keep
+
+
+def clean(
+    config: CleanupConfig,
+    splats: Splats,
+    points: Float[Tensor, "P 3"],
+    viewpoints: Float[Tensor, "V 3"],
+) -> Splats:
+    """Gaussians after dropping and truncating as configured, all in the aligned frame of the scene.
+
+    Truncated harmonics are fitted to the directions from the camera centres `viewpoints`.
+    """
+    kept = splats.select(kept_rows(config, splats, points)) if config.active else splats
+    if config.sh_degree is None or num_sh_bases(config.sh_degree) >= kept.sh.shape[1]:
+        return kept
+    fit = (
+        fit_truncation(kept.means, viewpoints, kept.sh_degree, config.sh_degree) if len(viewpoints) else None
+    )
+    return kept.with_sh(truncate_sh(kept.sh, config.sh_degree, fit))
+
+
+def agreement(first: Splats, second: Splats, cameras: Sequence[Camera]) -> float:
+    """PSNR in dB between the renders of two sets of Gaussians, pooled over all cameras; infinite if equal."""
+    errors = []
+    for camera in cameras:
+        one, other = (_picture(splats, camera) for splats in (first, second))
+        errors.append((one - other).square().mean())
+    return float(-10 * torch.log10(torch.stack(errors).mean()))
+
+
+@torch.no_grad()
+def _picture(splats: Splats, camera: Camera) -> Float[Tensor, "H W 3"]:
+    """Render, rounded to 8 bits."""
+    rendering = rasterize(
+        splats.means, splats.quats, splats.scales, splats.opacities, splats.sh.contiguous(), camera,
+        sh_degree=splats.sh_degree, near=NEAR, depth=False,
+    )  # fmt: skip
+    return (rendering.colors.double().clamp(0, 1) * 255).round() / 255

@@ -60,28 +60,13 @@ class Camera:
         return replace(self, K=K, width=width, height=height)
 
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
-        """Projects world points.
-
-        Args:
-            points: World coordinates.
-
-        Returns:
-            Pixel coordinates (x, y), undefined where the depth is not positive, and depths along the z axis of the
-            camera.
-        """
+        """Pixels (x, y) of world points, undefined where the depth is not positive, and depths along z."""
         seen = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         pixels = seen @ self.K.T
         return pixels[:, :2] / pixels[:, 2:], seen[:, 2]
 
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
-        """Back-projects all pixels.
-
-        Args:
-            depth: Depth along the z axis of the camera (not along the ray), world units.
-
-        Returns:
-            World coordinates of all pixel centres at these depths.
-        """
+        """World coordinates of all pixel centres at depths along z (not along the ray), world units."""
         rays = self.pixel_rays()
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
         return (rays * depth[..., None] - translation) @ rotation

@@ -29,13 +29,7 @@ MAX_SIDE = 32_768
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A camera path from a file.
-
-    Attributes:
-        cameras: One per video frame, all of one size.
-        fps: Frames per second.
-        frame: World frame of the cameras.
-    """
+    """A camera path from a file: a camera per video frame, all of one size, and their world frame."""
 
     cameras: tuple[Camera, ...]
     fps: float

@@ -18,26 +18,14 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics shared by all cameras of a trajectory.
-
-    Attributes:
-        focal: Focal length relative to the longer side of the image.
-        width: Image width in pixels.
-        height: Image height in pixels.
-    """
+    """Intrinsics of all cameras of a trajectory; `focal` is relative to the longer side, sizes are in pixels."""
 
     focal: float
     width: int
     height: int
 
     def camera(self, position: Vector, forward: Vector, up: Vector = UP) -> Camera:
-        """An upright camera.
-
-        Args:
-            position: Camera centre in world coordinates.
-            forward: Viewing direction, of any non-zero length.
-            up: Up direction, in world coordinates.
-        """
+        """An upright camera at a position, looking along `forward` (of any length), all in world coordinates."""
         z_axis = unit(forward)
         x_axis = np.cross(z_axis, up)
         if np.linalg.norm(x_axis) < 1e-6:  # looking straight up or down: any horizontal axis will do
@@ -85,10 +73,8 @@ def forwards_of(cameras: Sequence[Camera]) -> Float64[np.ndarray, "V 3"]:
 def focus(cameras: Sequence[Camera], centre: Vector, rounds: int = 10) -> Vector:
     """The point nearest to the viewing axes of all cameras, by iteratively reweighted least squares.
 
-    Args:
-        cameras: At least one.
-        centre: Weak prior, which decides where the axes do not (parallel cameras).
-        rounds: Iterations of reweighting, which suppresses cameras that look elsewhere.
+    `centre` is a weak prior, which decides where the axes do not (parallel cameras); reweighting suppresses
+    cameras that look elsewhere.
     """
     positions, forwards = positions_of(cameras), forwards_of(cameras)
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]

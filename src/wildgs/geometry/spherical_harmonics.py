@@ -76,11 +76,6 @@ def rgb_to_sh0(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     return (rgb - 0.5) / C0
 
 
-def sh0_to_rgb(sh0: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Colour of coefficients of degree 0, not clamped; the inverse of `rgb_to_sh0`."""
-    return sh0 * C0 + 0.5
-
-
 def sh_degree(sh: Float[Tensor, "N K 3"]) -> int:
     """Degree of spherical harmonics coefficients.
 
@@ -121,13 +116,10 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
 def truncate_sh(
     sh: Float[Tensor, "N K 3"], degree: int, fit: Float[Tensor, "N L M"] | None = None
 ) -> Float[Tensor, "N L 3"]:
-    """Coefficients of a lower degree.
+    """Coefficients of a lower degree; those of this degree or a lower one are returned unchanged.
 
-    Args:
-        sh: Coefficients.
-        degree: Degree of the result. Coefficients of this degree or a lower one are returned unchanged.
-        fit: From `fit_truncation` for the same degrees: preserves the colours in the directions of the cameras.
-            None drops the higher degrees, which is best on average over all directions.
+    A `fit` of `fit_truncation` for the same degrees preserves the colours in the directions of the cameras.
+    Without it the higher degrees are dropped, which is best on average over all directions.
 
     Raises:
         ValueError: The degree is out of range, or the fit is for other degrees.

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Float64
+from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.lens import Lens, Vector, focal_of, focus, forwards_of, positions_of, unit, usual_lens
-from wildgs.geometry.tour import open_tour, spread_out
 
 FULL_CIRCLE_GAP = 75.0
 """Degrees: an orbit is a full circle if no gap between the cameras is wider than this."""
@@ -22,27 +22,14 @@ TOUR_STOPS = 16
 
 
 def still(camera: Camera, frames: int, width: int, height: int) -> list[Camera]:
-    """One camera for all frames: for videos in which only the appearance changes.
-
-    Args:
-        camera: The camera; its focal length is kept relative to the longer side.
-        frames: Number of frames.
-        width: Image width in pixels.
-        height: Image height in pixels.
-    """
+    """One camera for all frames, with its focal length relative to the longer side: only the appearance changes."""
     return interpolate([camera], frames, width, height)
 
 
 def interpolate(cameras: Sequence[Camera], frames: int, width: int, height: int) -> list[Camera]:
-    """A smooth path through given cameras at constant speed, with ease-in and ease-out.
+    """A smooth path from the first to the last of the given cameras at constant speed, with ease-in and ease-out.
 
     Positions and rotations follow splines (twice differentiable); focal lengths are interpolated logarithmically.
-
-    Args:
-        cameras: At least one; the path starts at the first and ends at the last.
-        frames: Number of frames.
-        width: Image width in pixels.
-        height: Image height in pixels.
     """
     focal = np.log([focal_of(camera) for camera in cameras])
     kept = [cameras[0]]
@@ -91,13 +78,6 @@ def training_path(
 
     Photo collections are unordered; the order is a short tour through photos chosen by farthest-point sampling.
     Photos from far away and photos that look elsewhere are ignored.
-
-    Args:
-        cameras: Cameras of the training photos.
-        points: Sparse points of the scene.
-        frames: Number of frames.
-        width: Image width in pixels.
-        height: Image height in pixels.
     """
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
@@ -141,13 +121,6 @@ def orbit(
 
     A full circle if there are photos from all around; otherwise an arc over the photographed side (the facade),
     back and forth. The video loops in both cases.
-
-    Args:
-        cameras: Cameras of the training photos.
-        points: Sparse points of the scene.
-        frames: Number of frames.
-        width: Image width in pixels.
-        height: Image height in pixels.
     """
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
@@ -199,17 +172,7 @@ def spiral(
     turns: int = 2,
     radius: float = 0.12,
 ) -> list[Camera]:
-    """Small circles around the most central photo, looking at the landmark; the video loops.
-
-    Args:
-        cameras: Cameras of the training photos.
-        points: Sparse points of the scene.
-        frames: Number of frames.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        turns: Number of circles.
-        radius: Radius of the circles relative to the distance of the landmark.
-    """
+    """Circles (radius relative to the landmark's distance) around the most central photo; the video loops."""
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
     positions = positions_of(usual)
@@ -224,3 +187,23 @@ def spiral(
         place = home + size * (sideways + np.sin(phase) * forward)
         path.append(lens.camera(place, target - place))
     return path
+
+
+def spread_out(features: Float64[np.ndarray, "V D"], count: int) -> list[int]:
+    """Farthest-point sampling: indices of at most `count` rows, each the farthest from those before.
+
+    The first is the row nearest to the median, so that no outlier decides.
+    """
+    chosen = [int(np.linalg.norm(features - np.median(features, axis=0), axis=1).argmin())]
+    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(features)) and distance.max() > 0:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return chosen
+
+
+def open_tour(places: Float64[np.ndarray, "S D"]) -> list[int]:
+    """A short open tour through all places: the leaves of their cluster tree, ordered for short steps."""
+    if len(places) < 3:
+        return list(range(len(places)))
+    return leaves_list(linkage(places, "average", optimal_ordering=True)).tolist()

@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import filelock
 import torch
 
 from wildgs import processes
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.checkpoint import list_checkpoints
-from wildgs.engine.distributed import settle
+from wildgs.engine.distributed import assign_device
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
@@ -40,7 +38,7 @@ from wildgs.library.evaluation import PROTOCOLS, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.training import read_scene, train
 from wildgs.progress import Progress
-from wildgs.runs import CHECKPOINT_FOLDER, load_run
+from wildgs.runs import CHECKPOINT_FOLDER, holding, load_run
 from wildgs.scene import Scene
 from wildgs.version import __version__
 
@@ -53,7 +51,7 @@ POLL_SECONDS = 2.0
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What a benchmark left.
+    """A finished benchmark.
 
     Attributes:
         folder: Holds table.md, table.csv, table.json and the runs.
@@ -70,7 +68,7 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class _Request:
-    """What all runs have in common."""
+    """Arguments of `benchmark` that all runs share."""
 
     output: Path
     suite: Suite | None
@@ -99,7 +97,7 @@ def benchmark(
 ) -> Benchmark:
     """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
 
-    The same call goes on where it stopped and skips what is done. A run that fails is named, and the others go on.
+    The same call continues where it stopped and skips what is done. A run that fails does not stop the others.
 
     Args:
         scenes: Scene folders; for a suite, the folder that holds its scenes.
@@ -119,18 +117,11 @@ def benchmark(
     Raises:
         UserError: Something that was asked for does not exist, or the output holds other runs.
     """
-    request = _Request(
-        Path(output),
-        suite,
-        variants,
-        None if lpips is None else Path(lpips),
-        execution or ExecutionConfig(),
-        progress,
-        observers,
-        announce or logger.info,
-    )
+    lpips, execution = None if lpips is None else Path(lpips), execution or ExecutionConfig()
+    announce = announce or logger.info
+    request = _Request(Path(output), suite, variants, lpips, execution, progress, observers, announce)
     if processes.world_size() > 1:
-        settle()
+        assign_device()
     base = config or RunConfig()
     methods = default_bench_methods(suite) if methods is None else methods
     jobs = _plan(request, [Path(s) for s in scenes], base, methods, seeds)
@@ -146,11 +137,7 @@ def benchmark(
 
 
 def _plan(
-    request: _Request,
-    scenes: Sequence[Path],
-    base: RunConfig,
-    methods: Sequence[str],
-    seeds: Sequence[int],
+    request: _Request, scenes: Sequence[Path], base: RunConfig, methods: Sequence[str], seeds: Sequence[int]
 ) -> list[Job]:
     if not scenes or not seeds or not (methods or request.variants):
         raise UserError("a bench needs at least one scene, one of --methods or --variant, and one of --seeds")
@@ -164,7 +151,7 @@ def _plan(
 
 
 class _Bench:
-    """Runs jobs and gathers their scores; what is known of a job is what its folder holds."""
+    """Runs jobs and collects their scores; the state of a job is what its folder holds."""
 
     def __init__(self, request: _Request, jobs: Sequence[Job]) -> None:
         self.request = request
@@ -187,9 +174,9 @@ class _Bench:
         return same_network or not list_checkpoints(job.folder / CHECKPOINT_FOLDER)
 
     def open_jobs(self) -> Iterator[tuple[int, Job]]:
-        """Jobs that are neither done nor failed, with their numbers, until none is left; waits for other processes.
+        """Jobs that are neither done nor failed, with their numbers; waits for other processes' jobs.
 
-        A process that ends without finishing its job leaves it open, and one of the others takes it.
+        A job whose process ends before it is finished is taken by another process.
         """
         tried: set[int] = set()
         while True:
@@ -197,9 +184,11 @@ class _Bench:
             for number, job in enumerate(self.jobs):
                 if number in tried or self._is_closed(job):
                     continue
-                with _claim(job.folder) as claimed:
-                    waiting |= not claimed
-                    if claimed and not self._is_closed(job):
+                with holding(
+                    job.folder / CLAIM_FILE
+                ) as held:  # without locks, processes may repeat each other's work
+                    waiting |= held is False
+                    if held is not False and not self._is_closed(job):
                         tried.add(number)
                         yield number, job
             if not waiting:
@@ -210,7 +199,7 @@ class _Bench:
         return self.is_done(job) or self.failure(job) is not None
 
     def failure(self, job: Job) -> str | None:
-        """Why a job failed since this bench began, in whatever process; None where it did not."""
+        """Why a job failed since this bench began, in any process; None if it did not."""
         file = job.folder / FAILURE_FILE
         try:
             return file.read_text(encoding="utf-8") if file.stat().st_mtime >= self._began else None
@@ -223,10 +212,18 @@ class _Bench:
         return {title: reason for title, reason in found.items() if reason is not None}
 
     def do(self, job: Job) -> None:
-        """Trains and scores what is left of a job; notes its failure in the run folder."""
+        """Trains and scores the rest of a job; writes its failure to the run folder."""
         try:
             scene = self._read_scene(job.config)
-            train_job(job, scene, self.request)
+            train(
+                scene,
+                job.config,
+                output=job.folder,
+                execution=self.request.execution,
+                resume="auto",
+                progress=self.request.progress,
+                observers=self.request.observers,
+            )
             self._score(job, scene)
             (job.folder / FAILURE_FILE).unlink(missing_ok=True)
         except (UserError, MemoryError, torch.OutOfMemoryError) as error:
@@ -235,7 +232,7 @@ class _Bench:
             self.request.announce(f"failed: {reason}")
 
     def _read_scene(self, config: RunConfig) -> Scene:
-        """The scene of a run, kept for the next run where that reads it alike."""
+        """The scene of a run, cached for the next run on the same scene."""
         if self._scene is None or (self._scene[0].scene, self._scene[0].data) != (config.scene, config.data):
             self._scene = None  # frees its photos before the next scene's are read
             self._scene = config, read_scene(config, self.request.execution, self.request.progress)
@@ -253,7 +250,7 @@ class _Bench:
             evaluate(loaded, missing, scene=scene, lpips=self.request.lpips, progress=self.request.progress)
 
     def write_table(self) -> list[Row]:
-        """The table of all jobs that are done, on disk."""
+        """Writes the table of all finished jobs."""
         done = [job for job in self.jobs if self.is_done(job)]
         scores = [
             Score(job.scene, job.method, job.seed, metrics)
@@ -300,21 +297,8 @@ class _Bench:
         }
 
 
-def train_job(job: Job, scene: Scene, request: _Request) -> None:
-    """Trains a run from where it stands to its end."""
-    train(
-        scene,
-        job.config,
-        output=job.folder,
-        execution=request.execution,
-        resume="auto",
-        progress=request.progress,
-        observers=request.observers,
-    )
-
-
 def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
-    """The scores of a run, None where there are none that can be read."""
+    """The scores of a run; None if there are none, or they cannot be read."""
     try:
         content = json.loads((folder / "eval" / protocol / "metrics.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -323,32 +307,11 @@ def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
 
 
 def _notes(scores: Sequence[Score]) -> list[str]:
-    """What the scores' own notes say, each once; the legend has said already which network LPIPS has."""
+    """The distinct notes of the scores, without the network of LPIPS, which is in the legend."""
     notes = dict.fromkeys(note for score in scores for note in score.metrics.get("notes", ()))
     lines = [note for note in notes if not note.startswith("LPIPS v0.1")]
     more = len(lines) - MOST_NOTES
     return lines[:MOST_NOTES] + ([f"{more} more notes in the runs' metrics.json."] if more > 0 else [])
-
-
-@contextmanager
-def _claim(folder: Path) -> Iterator[bool]:
-    """Whether this process may work in a run folder while the block runs; the claim ends with the process."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder / CLAIM_FILE, timeout=0)
-        lock.acquire()
-    except filelock.Timeout:
-        yield False
-        return
-    except NotImplementedError:  # a disk without locks; processes that share it may repeat each other's work
-        yield True
-        return
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
-    try:
-        yield True
-    finally:
-        lock.release()
 
 
 def _write_text(file: Path, text: str) -> None:

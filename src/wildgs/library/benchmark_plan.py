@@ -1,4 +1,4 @@
-"""What `wildgs bench` has to do: methods and variants, scenes, and a run for each seed of each."""
+"""The runs of a benchmark: methods and variants on scenes, one for each seed."""
 
 from __future__ import annotations
 
@@ -40,15 +40,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Job:
-    """One run to train and to score.
-
-    Attributes:
-        scene: The scene's name in the table.
-        method: One of `BENCH_METHODS`, or a variant's name.
-        seed: Of the run.
-        folder: Its run folder.
-        config: Its configuration.
-    """
+    """One run to train and to score; `method` is one of `BENCH_METHODS` or the name of a variant."""
 
     scene: str
     method: str
@@ -115,7 +107,9 @@ def find_phototourism(places: Sequence[Path]) -> tuple[Path, ...]:
     if not scenes:
         raise UserError(f"{places_named}: none of the suite's scenes ({missing}) is there")
     if missing:
-        warnings.warn(f"{places_named}: no {missing}; the table goes without", WildGSWarning, stacklevel=2)
+        warnings.warn(
+            f"{places_named}: no {missing}; they are missing from the table", WildGSWarning, stacklevel=2
+        )
     for scene in scenes:
         if find_split_file(scene) is None:
             raise UserError(
@@ -134,7 +128,7 @@ def make_jobs(
     output: Path,
     reference: PresetName = "default",
 ) -> list[Job]:
-    """All runs: scene by scene, seed by seed, so that the first seed's table is complete early.
+    """All runs, by scene and then by seed, so that the table of the first seed is complete early.
 
     Args:
         scenes: Scene folders.
@@ -172,11 +166,11 @@ def make_jobs(
 def _check_unique(what: str, names: Sequence[str]) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise UserError(f"{what}: {name} is there twice; the table needs different names")
+            raise UserError(f"{what}: {name} is given twice; the table needs different names")
 
 
 def label_of(name: str) -> str:
-    """How the table calls a line of the bench; ablations as the paper's table has them."""
+    """The label of a method in the table; ablations as in the paper's table."""
     if name in METHODS:
         return method_type(name).label
     if name.endswith(HALF):
@@ -190,12 +184,7 @@ def label_of(name: str) -> str:
 
 
 def method_config(method: str, base: RunConfig, reference: PresetName = "default") -> RunConfig:
-    """The configuration of one of the bench's methods.
-
-    Args:
-        method: One of `BENCH_METHODS`.
-        base: What all runs share.
-        reference: The preset of methods, half-length runs and ablations.
+    """The configuration of one of `BENCH_METHODS`: `base`, with the preset `reference` but for lines of presets.
 
     Raises:
         UserError: There is no such method.
@@ -213,7 +202,7 @@ def method_config(method: str, base: RunConfig, reference: PresetName = "default
 
 
 def _check_stored(job: Job) -> None:
-    """Refuses a folder whose run has other settings: their scores must not stand in one table."""
+    """Raises `UserError` if a folder holds a run with other settings."""
     file = job.folder / CONFIG_FILE
     if not file.is_file():
         return

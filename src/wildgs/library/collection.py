@@ -1,4 +1,4 @@
-"""Which photos the poses of `wildgs run` were made from, so that another collection is not mistaken for it."""
+"""Records which photos the poses of `wildgs run` were computed from, to detect other photos in the same folder."""
 
 from __future__ import annotations
 
@@ -19,13 +19,7 @@ NAMED = 3
 
 @dataclass(frozen=True)
 class PhotoRecord:
-    """One photo.
-
-    Attributes:
-        size: Bytes.
-        modified: Time of the last change, nanoseconds.
-        digest: SHA-256 of its content.
-    """
+    """Size in bytes, time of the last change in nanoseconds, and SHA-256 of a photo."""
 
     size: int
     modified: int
@@ -64,7 +58,7 @@ def photo_files(folder: Path) -> dict[str, Path]:
 
 
 def record_collection(photos: Path, scene: Path, sfm: SfmConfig) -> None:
-    """Writes down, beside a scene, from which photos and with which options it was made.
+    """Writes, beside a scene, from which photos and with which options it was made.
 
     Raises:
         UserError: A photo cannot be read, or the disk is full.

@@ -52,6 +52,8 @@ class MixOptions:
     """Take local effects (shadows, lamps) from this appearance instead."""
     like: str | None = None
     """Photo of the scene whose camera and depth a picture borrows instead of being localised, or auto."""
+    sky: str | None = None
+    """Take the sky from this appearance instead."""
 
 
 @dataclass(frozen=True)

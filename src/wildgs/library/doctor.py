@@ -1,17 +1,23 @@
-"""`wildgs.examine`: what works on this machine."""
+"""`wildgs.examine`: what works on this machine; and the report for a bug, without names of people and machines."""
 
 from __future__ import annotations
 
+import getpass
 import importlib.metadata
 import importlib.util
 import os
 import platform
+import re
 import shutil
+import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+
+from wildgs.library.logs import LOG_FILE
+from wildgs.runs import CONFIG_FILE
 
 State = Literal["works", "missing", "broken"]
 
@@ -21,10 +27,10 @@ class Check:
     """One line of the report.
 
     Attributes:
-        name: What was looked at.
-        state: `missing` is something to get; `broken` is there and fails.
+        name: What was checked.
+        state: `missing` can be installed; `broken` is installed and fails.
         detail: What was found, or why it does not work and what is lost.
-        remedy: The command that gets it; None where there is nothing to do.
+        remedy: The command that installs or repairs it, if there is one.
     """
 
     name: str
@@ -40,7 +46,7 @@ def examine() -> list[Check]:
         ("PyTorch", _torch),
         ("CPU", _cpu),
         ("Numba", _numba),
-        ("rasteriser on the CPU", _cpu_rasterizer),
+        ("rasteriser on the CPU", lambda: _rasterize_one("rasteriser on the CPU", "cpu")),
         ("rasteriser on CUDA", _cuda_rasterizer),
         ("poses from photos", _pycolmap),
         ("encoder weights", _encoder_weights),
@@ -108,10 +114,6 @@ def _numba() -> Check:
     return Check("Numba", "works", f"{numba.__version__}, {cores}")
 
 
-def _cpu_rasterizer() -> Check:
-    return _rasterize_one("rasteriser on the CPU", "cpu")
-
-
 def _cuda_rasterizer() -> Check:
     import torch
 
@@ -145,11 +147,7 @@ def _gsplat(name: str) -> Check:
 
 
 def build_gsplat() -> None:
-    """Builds gsplat's CUDA extension, or loads it where it is built.
-
-    Raises:
-        UserError: It cannot be built here.
-    """
+    """Builds gsplat's CUDA extension unless it is built; raises `UserError` where it cannot be built."""
     from wildgs.errors import UserError
     from wildgs.rasterize import gsplat_library
 
@@ -195,20 +193,19 @@ def _encoder_weights() -> Check:
 
 
 def _depth_weights() -> Check:
-    from wildgs.priors.depth import DEPTH_ANYTHING
-
-    return _hub_weights("depth weights", DEPTH_ANYTHING, "scenes without depth/ train without the depth loss")
-
-
-def _hub_weights(name: str, repository: str, loss: str) -> Check:
-    """Whether a model lies in the Hugging Face cache; the hub is not asked."""
+    """Whether the network is in the Hugging Face cache; the hub is not asked."""
     from huggingface_hub import try_to_load_from_cache
 
+    from wildgs.priors.config import DEPTH_ANYTHING
+
+    name = "depth weights"
     # Other files of weights are pickles, which can run code.
-    if isinstance(try_to_load_from_cache(repository, "model.safetensors"), str):
-        return Check(name, "works", f"{repository} is cached")
-    detail = f"{repository} is not cached; it is fetched when first needed, and where that fails {loss}"
-    return Check(name, "missing", detail, f"hf download {repository}")
+    if isinstance(try_to_load_from_cache(DEPTH_ANYTHING, "model.safetensors"), str):
+        return Check(name, "works", f"{DEPTH_ANYTHING} is cached")
+    detail = (
+        f"{DEPTH_ANYTHING} is not cached; it is downloaded when first needed, or else there is no depth loss"
+    )
+    return Check(name, "missing", detail, f"hf download {DEPTH_ANYTHING}")
 
 
 def _lpips() -> Check:
@@ -235,3 +232,74 @@ def _videos() -> Check:
 
 def _pip(package: str, options: str = "") -> str:
     return " ".join(part for part in (sys.executable, "-m pip install", options, package) if part)
+
+
+PACKAGES = (
+    "wildgs",
+    "torch",
+    "numpy",
+    "numba",
+    "pycolmap",
+    "transformers",
+    "pillow",
+    "safetensors",
+    "gsplat",
+)
+LOG_LINES = 60
+LOG_BYTES = 200_000
+METRIC_LINES = 5
+_HOMES = re.compile(r"(/home/|/Users/|[A-Za-z]:\\Users\\)[^/\\\s'\":]+")
+
+
+def write_report(checks: Sequence[tuple[str, str, str]], run: Path | None) -> str:
+    """A bug report as text: the checks (name, state, detail), and the configuration and log of a run folder."""
+    parts = ["## Versions", *_versions(), "", "## This machine"]
+    parts += [f"- {name}: {state}: {detail}" for name, state, detail in checks]
+    if run is not None:
+        parts += ["", "## Configuration", "```yaml", _tail(run / CONFIG_FILE, 500), "```"]
+        parts += ["", "## Last log lines", "```", _tail(run / LOG_FILE, LOG_LINES), "```"]
+        parts += ["", "## Last metrics", "```", _tail(run / "metrics.jsonl", METRIC_LINES), "```"]
+        checkpoints = sorted((run / "checkpoints").glob("*")) if (run / "checkpoints").is_dir() else []
+        parts += ["", "## Checkpoints", *(f"- {p.name}: {p.stat().st_size:,} bytes" for p in checkpoints)]
+    return without_names("\n".join(parts))
+
+
+def without_names(text: str) -> str:
+    """The text without the user's home folder, the user's and the machine's name."""
+    home = str(Path.home())
+    if len(home) > 1:
+        text = text.replace(home, "~")
+    text = _HOMES.sub("~", text)
+    for name, stand_in in ((_user(), "USER"), (socket.gethostname(), "HOST")):
+        if name:
+            text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", stand_in, text)
+    return text
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except Exception:  # a user without an entry in the system's list
+        return ""
+
+
+def _versions() -> list[str]:
+    lines = [f"- Python {platform.python_version()} on {platform.system()} {platform.machine()}"]
+    for package in PACKAGES:
+        try:
+            lines.append(f"- {package} {importlib.metadata.version(package)}")
+        except importlib.metadata.PackageNotFoundError:
+            lines.append(f"- {package}: not installed")
+    return lines
+
+
+def _tail(path: Path, count: int) -> str:
+    """The last lines of a file, however long it is."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, 2)
+            file.seek(max(0, file.tell() - LOG_BYTES))
+            text = file.read().decode("utf-8", errors="replace")
+    except OSError as error:
+        return f"(cannot be read: {error})"
+    return "\n".join(text.splitlines()[-count:])

@@ -8,39 +8,18 @@ from pathlib import Path
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
-from wildgs.exporters.cleanup import agreement, clean
 from wildgs.exporters.config import CleanupConfig
 from wildgs.exporters.formats import SplatFormat, write_splats
-from wildgs.exporters.splats import Splats
+from wildgs.exporters.splats import Splats, agreement, clean
 from wildgs.library.config import ExportFormat, MixOptions
-from wildgs.library.loaded import LoadedScene
+from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.library.logs import logger
-from wildgs.library.looks import find_looks, loaded
-from wildgs.library.webpage import baked, page_looks, viewpoints_of, write_webpage
+from wildgs.library.pages import ExportedFile, baked, page_looks, viewpoints_of, write_webpage
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.progress import Progress
 
 COMPARED_VIEWS = 4
 PAGE_FILE = "page.html"
-
-
-@dataclass(frozen=True)
-class ExportedFile:
-    """A written file.
-
-    Attributes:
-        file: Where it was written.
-        megabytes: Its size.
-        num_gaussians: Gaussians in it.
-        sh_degree: Degree of its spherical harmonics.
-        looks: The appearances that it holds: one, or all of the page's.
-    """
-
-    file: Path
-    megabytes: float
-    num_gaussians: int
-    sh_degree: int
-    looks: tuple[Look, ...]
 
 
 @dataclass(frozen=True)
@@ -132,8 +111,7 @@ def _write_page(request: _Request, looks: Sequence[Look], *, alone: bool) -> Exp
         file = file / PAGE_FILE
     if request.cleanup.active:
         _cleaned(request, looks[0])
-    page = write_webpage(request.scene, looks, file, title=request.title, cleanup=request.cleanup)
-    return ExportedFile(page.file, page.megabytes, page.num_gaussians, page.sh_degree, tuple(looks))
+    return write_webpage(request.scene, looks, file, title=request.title, cleanup=request.cleanup)
 
 
 def _write_look(request: _Request, look: Look, files: dict[SplatFormat, Path]) -> list[ExportedFile]:

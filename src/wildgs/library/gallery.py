@@ -1,4 +1,4 @@
-"""`wildgs.gallery`: views times appearances at a glance: does light transfer, does geometry hold?"""
+"""`wildgs.gallery`: views times appearances on one contact sheet."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
 
 from wildgs.errors import UserError
-from wildgs.evaluation.pictures import picture_paths, write_picture
-from wildgs.exporters.sheet import contact_sheet
 from wildgs.files import written_aside
 from wildgs.library.config import MixOptions
-from wildgs.library.loaded import LoadedScene
-from wildgs.library.looks import find_looks, loaded
-from wildgs.library.showcase import different_lights
+from wildgs.library.loaded import LoadedScene, find_looks, loaded
+from wildgs.library.pages import different_lights
+from wildgs.library.rendering import render_each
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.light.sources import read_picture
-from wildgs.progress import Progress, counter
-from wildgs.scene import Scene, View, find_view, match_view
+from wildgs.progress import Progress
+from wildgs.scene import Scene, find_view, match_view
 
 VIEWS, LIGHTS = 4, 5
 TILE = 320
 QUALITY = 92
+GAP = 6
+PAPER, INK = (255, 255, 255), (40, 40, 40)
+Picture = UInt8[np.ndarray, "_ _ 3"]
 FORMATS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
 
 
@@ -68,83 +70,42 @@ def gallery(
         UserError: A view or an appearance does not exist, or the output cannot be written.
     """
     scene = loaded(run)
-    rows = [find_view(scene.scene, name) for name in views] or some_views(scene.scene)
+    held_out = scene.scene.test_views or scene.scene.train_views
+    rows = [find_view(scene.scene, name) for name in views] or held_out[:: max(1, -(-len(held_out) // VIEWS))]
     if not rows:
         raise UserError(f"{scene.scene.root} has no photo with a camera")
-    specs = appearance or default_lights(scene)
+    specs = appearance or _default_lights(scene)
     looks = find_looks(scene, specs, mixing, progress=progress)
     output = scene.run.folder / "gallery" if output is None else Path(output)
     single = output.suffix.lower() in FORMATS
     sheet, folder = (output, None) if single else (output / "gallery.jpg", output)
-    tiles = render_tiles(scene, rows, looks, folder, progress)
-    # A mix of several photos has no photo to stand above it.
-    sources = [source_picture(scene.scene, spec) for spec in specs] if len(looks) == len(specs) else []
+    tiles = [picture.numpy() for picture in render_each(scene, rows, looks, folder, progress=progress)]
+    grid: list[list[Picture | None]] = [
+        [view.read_photo().numpy(), *tiles[number * len(looks) :][: len(looks)]]
+        for number, view in enumerate(rows)
+    ]
+    # A mix of several photos has no photo of its own to show above it.
+    sources = [_source(scene.scene, spec) for spec in specs] if len(looks) == len(specs) else []
+    if any(source is not None for source in sources):
+        grid.insert(0, [None, *sources])
+    camera = rows[0].camera
+    scale = min(1.0, TILE / max(camera.width, camera.height))
+    tile = (round(camera.width * scale), round(camera.height * scale))
+    picture = contact_sheet(grid, ["the view's photo", *(look.name for look in looks)], tile=tile)
     with written_aside(sheet) as aside:
-        draw_sheet(rows, looks, tiles, sources).save(aside, FORMATS[sheet.suffix.lower()], quality=QUALITY)
+        picture.save(aside, FORMATS[sheet.suffix.lower()], quality=QUALITY)
     return WrittenGallery(sheet, folder, tuple(view.name for view in rows), tuple(looks))
 
 
-def draw_sheet(
-    views: Sequence[View],
-    looks: Sequence[Look],
-    tiles: Sequence[Sequence[np.ndarray]],
-    sources: Sequence[np.ndarray | None],
-) -> Image.Image:
-    """The grid: below the photos that lend their light, beside those whose viewpoint is taken."""
-    rows: list[list[np.ndarray | None]] = []
-    if any(source is not None for source in sources):
-        rows.append([None, *sources])
-    for view, row in zip(views, tiles, strict=True):
-        rows.append([view.read_photo().numpy(), *row])
-    camera = views[0].camera
-    scale = min(1.0, TILE / max(camera.width, camera.height))
-    tile = (round(camera.width * scale), round(camera.height * scale))
-    return contact_sheet(rows, ["the view's photo", *(look.name for look in looks)], tile=tile)
-
-
-def some_views(scene: Scene) -> list[View]:
-    """A few held-out views, evenly spread; training views where none are held out."""
-    views = scene.test_views or scene.train_views
-    return list(views[:: max(1, -(-len(views) // VIEWS))][:VIEWS])
-
-
-def default_lights(scene: LoadedScene) -> list[str]:
-    """The mean light and a few photos as unlike each other as the collection allows."""
+def _default_lights(scene: LoadedScene) -> list[str]:
+    """The mean light and a few photos as different as the collection has them."""
     if not scene.relightable:
         return [NEUTRAL]
     return [NEUTRAL, *(view.name for view in different_lights(scene.scene.train_views, LIGHTS))]
 
 
-def render_tiles(
-    scene: LoadedScene,
-    views: Sequence[View],
-    looks: Sequence[Look],
-    output: Path | None,
-    progress: Progress | None = None,
-) -> list[list[np.ndarray]]:
-    """Renders every view under every look; writes each as OUTPUT/<appearance>/<view>.png where there is a folder.
-
-    Returns:
-        Rows of views, columns of looks.
-    """
-    paths = picture_paths([view.name for view in views])
-    folders = picture_paths([look.name for look in looks])
-    show = counter(progress, "rendering")
-    rows = []
-    for index, view in enumerate(views):
-        row = []
-        for number, look in enumerate(looks):
-            picture = scene.render(view.camera, look)
-            if output is not None:
-                write_picture(output / folders[look.name].with_suffix("") / paths[view.name], picture)
-            row.append(picture.numpy())
-            show(index * len(looks) + number + 1, len(views) * len(looks))
-        rows.append(row)
-    return rows
-
-
-def source_picture(scene: Scene, spec: str) -> np.ndarray | None:
-    """The picture that lends a look its light, where there is one."""
+def _source(scene: Scene, spec: str) -> np.ndarray | None:
+    """The picture from which an appearance is taken, if there is one."""
     view = match_view(scene.views, spec)
     if view is not None:
         return view.read_photo().numpy()
@@ -152,3 +113,60 @@ def source_picture(scene: Scene, spec: str) -> np.ndarray | None:
     if spec == NEUTRAL or file.suffix == ".safetensors" or not file.is_file():
         return None
     return read_picture(file).numpy()
+
+
+def fit(picture: Picture, width: int, height: int) -> Image.Image:
+    """Fits a picture into a tile, padded where its aspect ratio differs."""
+    image = Image.fromarray(picture)
+    scale = min(width / image.width, height / image.height)
+    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    tile = Image.new("RGB", (width, height), PAPER)
+    tile.paste(
+        image.resize(size, Image.Resampling.LANCZOS), ((width - size[0]) // 2, (height - size[1]) // 2)
+    )
+    return tile
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[Picture | None]],
+    captions: Sequence[str],
+    *,
+    tile: tuple[int, int],
+) -> Image.Image:
+    """Pictures in rows and columns, with a caption above each column.
+
+    Args:
+        rows: Pictures, None for an empty tile; all rows of one length.
+        captions: Captions of the columns.
+        tile: Width and height of a tile in pixels; the aspect ratio of pictures is kept.
+    """
+    width, height = tile
+    letters = max(10, round(height * 0.075))
+    font = ImageFont.load_default(size=letters)
+    above = round(1.6 * letters)
+    sheet = Image.new(
+        "RGB",
+        (len(captions) * (width + GAP) + GAP, above + len(rows) * (height + GAP) + GAP),
+        PAPER,
+    )
+    draw = ImageDraw.Draw(sheet)
+    for column, caption in enumerate(captions):
+        left = GAP + column * (width + GAP)
+        words = shorten(caption, font, width)
+        draw.text((left, above / 2 + GAP / 2), words, fill=INK, font=font, anchor="lm")
+        for row, pictures in enumerate(rows):
+            picture = pictures[column]
+            if picture is not None:
+                sheet.paste(fit(picture, width, height), (left, above + GAP + row * (height + GAP)))
+    return sheet
+
+
+def shorten(words: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> str:
+    """Shortens a caption to a width in pixels by an ellipsis in its middle."""
+    if font.getlength(words) <= width:
+        return words
+    for kept in range(len(words) - 1, 1, -1):
+        head, tail = words[: -(-kept // 2)], words[len(words) - kept // 2 :]
+        if font.getlength(f"{head}…{tail}") <= width:
+            return f"{head}…{tail}"
+    return ""

@@ -1,4 +1,4 @@
-"""The Python API: one trained scene, any light, any camera.
+"""The Python API: one trained scene under any appearance, from any camera.
 
 scene = wildgs.load("runs/gate")
 look = scene.appearance("evening.jpg")
@@ -8,6 +8,7 @@ image = scene.render(scene.views[0].camera, look)
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -18,9 +19,10 @@ from wildgs.errors import UserError
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.photos import PhotoFit, find_misfits, inspect_photos, read_photos, write_photos
 from wildgs.geometry.camera import Camera
-from wildgs.light.look import Look
+from wildgs.library.config import MixOptions
+from wildgs.light.look import Look, Timeline, mix, with_sky
+from wildgs.light.saved import save_look
 from wildgs.light.sources import LightSources
-from wildgs.light.timeline import Timeline
 from wildgs.model.gaussians import Gaussians
 from wildgs.progress import Progress, counter
 from wildgs.rasterize import blend
@@ -28,7 +30,7 @@ from wildgs.runs import Run, load_run
 from wildgs.scene import Scene, View
 from wildgs.scene.trajectories import make_path
 
-LANDMARK_FILE = "landmarks.safetensors"
+FEATURE_INDEX_FILE = "feature_index.safetensors"
 """In the run folder: what new photos are localised against, made when the first one comes."""
 
 
@@ -40,9 +42,8 @@ class LoadedScene:
     """
 
     def __init__(self, run: Run) -> None:
-        """Sets up a `LoadedScene`; `load` is the usual way."""
         self.run = run
-        self._sources = LightSources(run.method, lambda: self.scene, run.folder / LANDMARK_FILE)
+        self._sources = LightSources(run.method, lambda: self.scene, run.folder / FEATURE_INDEX_FILE)
 
     @property
     def scene(self) -> Scene:
@@ -174,3 +175,93 @@ def load(run: str | Path, device: torch.device | str | None = None) -> LoadedSce
         UserError: The folder holds no run, or no checkpoint yet.
     """
     return LoadedScene(load_run(Path(run), None if device is None else torch.device(device)))
+
+
+@dataclass(frozen=True)
+class SavedAppearance:
+    """A written appearance.
+
+    Attributes:
+        file: Where it was written.
+        look: What it holds.
+    """
+
+    file: Path
+    look: Look
+
+
+def appearance(
+    run: str | Path | LoadedScene,
+    photos: str | Path | Sequence[str | Path],
+    output: str | Path,
+    *,
+    mixing: MixOptions | None = None,
+    progress: Progress | None = None,
+) -> SavedAppearance:
+    """Saves the light of a photo, or a mix of several, as a small file that holds no code (safetensors).
+
+    Args:
+        run: A run folder, or a loaded scene. The file belongs to the run at its present step.
+        photos: What `LoadedScene.appearance` takes; several with weights.
+        output: File to write, ending in .safetensors.
+        mixing: How several photos become one appearance.
+        progress: Called during long work.
+
+    Raises:
+        UserError: An appearance cannot be had, there is more than one, or the file cannot be written.
+    """
+    scene = loaded(run)
+    specs = [photos] if isinstance(photos, (str, Path)) else photos
+    looks = find_looks(scene, specs, mixing, progress=progress)
+    if len(looks) != 1:
+        raise UserError(
+            f"{len(looks)} appearances do not go into one file; give one, or mix them by --weights"
+        )
+    return SavedAppearance(save_look(looks[0], Path(output)), looks[0])
+
+
+def loaded(run: str | Path | LoadedScene) -> LoadedScene:
+    """The loaded scene that a user means by a run folder or by itself."""
+    return run if isinstance(run, LoadedScene) else load(run)
+
+
+def find_looks(
+    scene: LoadedScene,
+    specs: Sequence[str | Path | Look],
+    mixing: MixOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> list[Look]:
+    """The looks of some appearances: one for each, or a single mixed one.
+
+    Args:
+        scene: The loaded scene.
+        specs: What `LoadedScene.appearance` takes.
+        mixing: How they are found and mixed.
+        progress: Called during long work.
+
+    Raises:
+        UserError: An appearance cannot be had, or the options contradict each other.
+    """
+    mixing = mixing or MixOptions()
+
+    def find(spec: str | Path | Look) -> Look:
+        return scene.appearance(spec, like=mixing.like, progress=progress)
+
+    parts = (mixing.global_, mixing.local)
+    if None not in parts:
+        specs = ()  # both parts come from elsewhere
+    looks = [find(spec) for spec in specs]
+    if mixing.weights:
+        looks = [mix(looks, mixing.weights)]
+    if parts != (None, None):
+        if len(looks) > 1:
+            raise UserError(
+                "--global and --local change one appearance; give one, or --weights to mix several"
+            )
+        both = [looks[0] if spec is None else find(spec) for spec in parts]
+        looks = [mix(both, [1, 0], local_weights=[0, 1])]
+    if mixing.sky is None:
+        return looks
+    sky = find(mixing.sky)
+    return [with_sky(look, sky) for look in looks]

@@ -1,13 +1,19 @@
-"""A run's own log: what the console showed of warnings, and why training ended."""
+"""Signals during training: the first finishes the step and saves, the second stops at once."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
 
+from wildgs.engine.team import Team
+from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError
 
 LOG_FILE = "train.log"
@@ -17,7 +23,7 @@ logger = logging.getLogger("wildgs")
 
 @contextmanager
 def run_log(folder: Path) -> Iterator[None]:
-    """Appends to the run's log while the block runs; a disk that refuses is passed over."""
+    """Appends to the run's log while the block runs; training continues without it if it cannot be written."""
     logging.raiseExceptions = False  # a full disk must not fill the console with tracebacks of the log
     try:
         handler = logging.FileHandler(folder / LOG_FILE, encoding="utf-8", errors="backslashreplace")
@@ -44,3 +50,57 @@ def run_log(folder: Path) -> Iterator[None]:
         logger.setLevel(level)
         with contextlib.suppress(OSError):
             handler.close()
+
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Ctrl-C, the end of a cluster job's time, and a closed terminal."""
+
+logger = logging.getLogger("wildgs")
+
+
+class InterruptedTrainingError(KeyboardInterrupt):
+    """Training was stopped by a signal and is saved; `code` is the exit code of the process, 128 + signal."""
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.code = 128 + number
+
+
+class StopOnSignal:
+    """An observer of training that ends it between two steps after a signal."""
+
+    def __init__(self, team: Team | None = None) -> None:
+        """Ends all processes of a team after the same step."""
+        self.team = team or Team()
+        self.received: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopOnSignal:
+        if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+                    self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        if self.received is not None:
+            if number == getattr(signal, "SIGHUP", None):
+                return  # a closed terminal sends it to every process of a group, more than once
+            raise KeyboardInterrupt
+        self.received = self.team.received_signal = number
+        with contextlib.suppress(OSError, RuntimeError):  # the signal may have come in the middle of a write
+            logger.info("stopping after this step, then saving; a second signal stops at once, unsaved")
+
+    def __call__(self, report: StepReport) -> None:
+        """Raises `InterruptedTrainingError` if a rank has received a signal."""
+        if self.team.stop_signal:
+            raise InterruptedTrainingError(f"interrupted at step {report.step}", self.team.stop_signal)

@@ -1,4 +1,4 @@
-"""`wildgs.run`: a folder of photos becomes a scored scene with pages to look at."""
+"""`wildgs.run` (a folder of photos), `wildgs.demo` (the built-in photos) and `wildgs.estimate_depth`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from wildgs.library.collection import (
 )
 from wildgs.library.evaluation import Scores, evaluate
 from wildgs.library.logs import logger
-from wildgs.library.showcase import write_showcase
+from wildgs.library.pages import write_scene_page, write_showcase
 from wildgs.library.training import read_scene, train
-from wildgs.library.webpage import write_scene_page
+from wildgs.model.config import ParsingConfig, WildGSConfig
+from wildgs.model.registry import MethodName, method_type
 from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
+from wildgs.scene.demo import write_demo_scene
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.reconstruction import check_photos, reconstruct
 
@@ -65,7 +67,7 @@ def run(
 ) -> FinishedRun:
     """Poses, trains, scores and shows a folder of photos; stages that are done already are not done again.
 
-    A training that was interrupted goes on with the options that it began with, where they are None.
+    A training that was interrupted continues with the options that it began with, where they are None.
 
     Args:
         photos: Folder of photos.
@@ -138,7 +140,7 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
             f"{scene} has poses that were made with other options ({options}); leave them out, or choose another "
             "--output"
         )
-    logger.info("%s has poses of these photos already; going on with them", scene)
+    logger.info("%s has poses of these photos already; continuing with them", scene)
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def estimate_depth(
 
 
 def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
-    """Fills what is missing in the scene's depth folder; warns and goes on where the network cannot be had."""
+    """Fills what is missing in the scene's depth folder; warns and continues where the network cannot be had."""
     estimator = load_depth_anything()
     if estimator is not None:
         fill_depth_folder(scene, estimator, progress=counter(progress, "estimating depth"))
@@ -225,3 +227,70 @@ def _photo_size(output: Path, max_side: int | None, downscale: float | None) -> 
             return read_config(output / CONFIG_FILE).data
         max_side = GPU_LONG_SIDE if default_device().type == "cuda" else CPU_LONG_SIDE
     return DataConfig(downscale=downscale or 1, max_side=max_side)
+
+
+COMPARED: tuple[MethodName, ...] = ("wildgs", "3dgs")
+TITLE = "Wild-GS demo"
+SUMMARY = (
+    "A made-up landmark in {photos} rendered photos: different hours and cameras, and people in the way. Wild-GS "
+    "and plain 3D Gaussian Splatting were trained on them for {steps:,} steps each. Both are scored on held-out "
+    "photos, against the same views without the people."
+)
+PARSED_SIDE = 160
+MAX_GAUSSIANS = 30_000
+"""As many Gaussians as photos of this size can resolve."""
+
+
+def demo(
+    output: str | Path = "wildgs-demo",
+    *,
+    steps: int = 1500,
+    execution: ExecutionConfig | None = None,
+    progress: Progress | None = None,
+    observers: Sequence[Observer] = (),
+) -> FinishedRun:
+    """Trains Wild-GS and plain 3DGS on the photos of the built-in landmark, scores both and writes pages.
+
+    Args:
+        output: Folder for the scene, both runs, report.html and scene.html.
+        steps: Training steps of each method.
+        execution: How it is executed.
+        progress: Called during all stages.
+        observers: Called with a `StepReport` after every training step.
+
+    Raises:
+        UserError: The pages exist already, or the folder cannot be written to.
+    """
+    output = Path(output)
+    report, page = output / "report.html", output / "scene.html"
+    if steps < 1:
+        raise UserError(f"steps {steps}: must be 1 or more")
+    if report.exists():
+        raise UserError(f"{report} exists already; open it, or choose another --output")
+    with lock_run(output):
+        folder = write_demo_scene(output / "scene")
+        runs = []
+        for method in COMPARED:
+            config = _configuration(folder, method, steps)
+            scene = read_scene(config, execution or ExecutionConfig(), progress)
+            target = output / method
+            train(
+                scene,
+                config,
+                output=target,
+                execution=execution,
+                resume="auto",
+                progress=progress,
+                observers=observers,
+            )
+            loaded = load_run(target)
+            runs.append((method_type(method).label, loaded, evaluate(loaded, scene=scene, progress=progress)))
+        write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
+        write_scene_page(runs[0][1], page, TITLE, progress)
+    return FinishedRun(output, {name: scores for name, _, scores in runs}, report, page)
+
+
+def _configuration(folder: Path, method: MethodName, steps: int) -> RunConfig:
+    train = TrainConfig(steps=steps, density=DensityConfig(max_gaussians=MAX_GAUSSIANS))
+    model = WildGSConfig(parsing=ParsingConfig(max_side=PARSED_SIDE))
+    return RunConfig(folder.resolve(), model=model, train=train).with_method(method)

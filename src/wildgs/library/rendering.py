@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
+from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
@@ -14,11 +17,10 @@ from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.trajectory import still
 from wildgs.library.config import MixOptions, TrajectoryOptions
-from wildgs.library.loaded import LoadedScene
-from wildgs.library.looks import find_looks, loaded
+from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.progress import Progress, counter
-from wildgs.scene import find_view
+from wildgs.scene import View, find_view
 from wildgs.scene.trajectories import AROUND, THROUGH, read_path
 
 DEFAULT_PATH = "orbit"
@@ -87,7 +89,7 @@ def render(
     scene = loaded(run)
     cameras, fps = _find_cameras(scene, trajectory, views)
     looks = find_looks(scene, appearance, mixing, progress=progress)
-    like = MixOptions(like=mixing.like if mixing else None)
+    like = MixOptions(like=mixing.like, sky=mixing.sky) if mixing else None
     looks += find_looks(scene, to, like, progress=progress)
     if is_video(output):
         cameras = [_even(camera) for camera in cameras]
@@ -97,11 +99,7 @@ def render(
 
 
 def check_size(width: int, height: int) -> None:
-    """Refuses sizes that are no picture, or more than memory should be asked for.
-
-    Raises:
-        UserError: The size is one of those.
-    """
+    """Raises `UserError` for sizes without pixels, or with too many."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise UserError(
             f"--size {width} {height}: sides must be from 1 to {MAX_SIDE:,} pixels, and the picture at most "
@@ -133,27 +131,47 @@ def _render_views(
         views = views if names else views[:1]
         if len(views) * len(looks) != 1:
             raise UserError(f"{output} holds one picture; give one --view and one --appearance, or a folder")
-    cameras = [view.camera if size is None else still(view.camera, 1, *size)[0] for view in views]
+    shape = (0, 0)
+    for picture in render_each(scene, views, looks, None if single else output, size, progress):
+        shape = (picture.shape[1], picture.shape[0])
+        if single:
+            write_picture(output, picture)
+    return Rendered(output, len(views) * len(looks), shape, None, tuple(looks))
+
+
+def render_each(
+    scene: LoadedScene,
+    views: Sequence[View],
+    looks: Sequence[Look],
+    folder: Path | None,
+    size: tuple[int, int] | None = None,
+    progress: Progress | None = None,
+) -> Iterator[UInt8[Tensor, "_ _ 3"]]:
+    """Renders every view under every look, one view after the other.
+
+    Args:
+        scene: The loaded scene.
+        views: Photos whose viewpoints are rendered.
+        looks: Their appearances.
+        folder: Each picture is written to FOLDER/<appearance>/<view>.png; None writes nothing.
+        size: Width and height; None takes each photo's own.
+        progress: Called for every picture.
+    """
     paths = picture_paths([view.name for view in views])
     folders = picture_paths([look.name for look in looks])
     show = counter(progress, "rendering")
-    for number, look in enumerate(looks):
-        folder = output / folders[look.name].with_suffix("")
-        for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
-            write_picture(output if single else folder / paths[view.name], scene.render(camera, look))
-            show(number * len(views) + index + 1, len(views) * len(looks))
-    shape = (cameras[-1].width, cameras[-1].height)
-    return Rendered(output, len(views) * len(looks), shape, None, tuple(looks))
+    for number, (view, look) in enumerate(product(views, looks), start=1):
+        picture = scene.render(view.camera if size is None else still(view.camera, 1, *size)[0], look)
+        if folder is not None:
+            write_picture(folder / folders[look.name].with_suffix("") / paths[view.name], picture)
+        show(number, len(views) * len(looks))
+        yield picture
 
 
 def _find_cameras(
     scene: LoadedScene, trajectory: TrajectoryOptions, views: Sequence[str]
 ) -> tuple[list[Camera], float]:
-    """The video's cameras and its frames per second.
-
-    Raises:
-        UserError: The path cannot be had, or is too short or too long.
-    """
+    """The video's cameras and its frames per second."""
     kind = trajectory.path or ("views" if len(views) > 1 else DEFAULT_PATH)
     fps = trajectory.fps or DEFAULT_FPS
     if kind not in (*AROUND, *THROUGH) and Path(kind).suffix and trajectory.size is None:

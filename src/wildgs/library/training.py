@@ -1,4 +1,4 @@
-"""`wildgs.train`: a scene with poses becomes a trained run; memory, records, checkpoints and signals around it."""
+"""`wildgs.train`: trains a scene with poses, within memory, with records, checkpoints and signals."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ import torch
 
 from wildgs import features
 from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
-from wildgs.engine.autosave import Autosave
-from wildgs.engine.checkpoint_writer import CheckpointWriter
+from wildgs.engine.autosave import Autosave, CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.photos import PhotoFit, describe_misfits, inspect_photos, write_photos
-from wildgs.library.interrupts import InterruptedTrainingError, StopOnSignal
-from wildgs.library.logs import logger, run_log
+from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, run_log
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import (
     CHECKPOINT_FOLDER,
@@ -44,17 +42,17 @@ from wildgs.threads import limited
 LEAST_SECONDS_ON_CUDA = 60.0
 """Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
 RETRY_SHARE = 0.8
-"""Share of the Gaussians with which memory ran out that the second try may have."""
+"""Bound on the Gaussians of the second try, as a share of those with which memory ran out."""
 BUDGET = "train.density.max_gaussians"
 """The one entry that may change when a run is resumed: it depends on the machine's memory."""
 
 Attachment = Callable[[Trainer, Scene], AbstractContextManager[Observer]]
-"""Opens an observer for one training, as a viewer is; closed when the training ends or fails."""
+"""Opens an observer of one training, such as a viewer, which is closed when the training ends or fails."""
 
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """What a training left.
+    """A finished training.
 
     Attributes:
         folder: The run folder.
@@ -62,7 +60,7 @@ class TrainedRun:
         steps: Steps done.
         seconds: Training time, without reading photos and saving.
         num_gaussians: N at the end.
-        device: Where it was trained.
+        device: Name of the GPU, or the CPU.
         photos: How well each training photo fits; `find_misfits` picks those that fit no light.
     """
 
@@ -77,7 +75,7 @@ class TrainedRun:
 
 @dataclass(frozen=True)
 class _Job:
-    """What stays the same when a training is tried again."""
+    """What stays the same when training is tried again with fewer Gaussians."""
 
     folder: Path
     scene: Scene
@@ -104,16 +102,16 @@ def train(
 ) -> TrainedRun:
     """Trains a run to its end.
 
-    The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. Where a GPU's memory runs
-    out, training goes on once from the newest checkpoint with fewer Gaussians.
+    The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. If a GPU's memory runs out,
+    training continues once from the newest checkpoint with fewer Gaussians.
 
     Args:
         scene: A scene folder, or a scene read from one.
-        config: What decides the outcome; the defaults where None, or the run's own on resuming.
+        config: Options that decide the outcome; None takes the defaults, or the run's own on resuming.
         output: The run folder.
-        execution: How it is executed; without influence on the outcome.
-        resume: Go on from the newest checkpoint; "auto" does so where the folder holds a run.
-        max_gaussians: A bound on the number of Gaussians that is refused, not lowered, where memory is short.
+        execution: Options without influence on the outcome.
+        resume: Continue from the newest checkpoint; "auto" does so if the folder holds a run.
+        max_gaussians: Bound on the number of Gaussians; it is an error, not lowered, if memory is too small for it.
         progress: Called for every photo read and for every step.
         observers: Called with a `StepReport` after every step.
         attach: Openers of further observers, which are closed when training ends.
@@ -142,10 +140,10 @@ def train(
             config = with_budget(config, max_gaussians)
         if not isinstance(scene, Scene):
             config = replace(config, scene=Path(scene).resolve())
-        with team.together():
+        with team.propagate_errors():
             read = scene if isinstance(scene, Scene) else read_scene(config, execution, progress)
         if not resume:
-            with team.together():
+            with team.propagate_errors():
                 config = plan_memory(config, read, explicit=max_gaussians is not None)
             config = with_budget(config, team.least(config.train.density.max_gaussians))
         job = _Job(folder, read, execution, team, progress, observers, attach)
@@ -153,11 +151,7 @@ def train(
 
 
 def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunConfig:
-    """The configuration with which a run goes on.
-
-    Raises:
-        UserError: Another one is asked for than the run began with.
-    """
+    """The configuration of a resumed run; raises `UserError` if another one is asked for than the run has."""
     if asked is None:
         return stored
     differing = differing_entries(stored, asked)
@@ -165,8 +159,8 @@ def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunCon
     if differing:
         changes = ", ".join(f"{path} is {old}, not {new}" for path, (old, new) in list(differing.items())[:3])
         raise UserError(
-            f"{folder} holds a run with other settings ({changes}): a run goes on with those it began with; leave "
-            "the options out, or choose another --output for a new run"
+            f"{folder} holds a run with other settings ({changes}), which resuming cannot change; leave these "
+            "options out, or choose another --output for a new run"
         )
     return asked
 
@@ -175,22 +169,13 @@ def read_scene(config: RunConfig, execution: ExecutionConfig, progress: Progress
     """Reads the scene of a configuration, and logs what is in it."""
     show = counter(progress, "reading photos")
     scene = load_scene(config.scene, config.data, image_cache=execution.image_cache, progress=show)
-    logger.info(
-        "%s: %d photos train, %d test, %s points",
-        scene.root,
-        len(scene.train_views),
-        len(scene.test_views),
-        f"{len(scene.points):,}",
-    )
+    train, test = len(scene.train_views), len(scene.test_views)
+    logger.info(f"{scene.root}: {train} photos train, {test} test, {len(scene.points):,} points")
     return scene
 
 
 def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
-    """The same run with another bound on the number of Gaussians.
-
-    Raises:
-        UserError: The bound is below 1.
-    """
+    """The configuration with another bound on the number of Gaussians, which must be 1 or more."""
     if max_gaussians < 1:
         raise UserError(f"--max-gaussians {max_gaussians}: must be 1 or more")
     density = replace(config.train.density, max_gaussians=max_gaussians)
@@ -198,11 +183,7 @@ def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
 
 
 def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> RunConfig:
-    """The run with a budget of Gaussians that fits into memory; a warning says where it was lowered.
-
-    Raises:
-        UserError: It cannot fit.
-    """
+    """The configuration with a budget of Gaussians that fits into memory; warns if it is lowered."""
     asked = config.train.density.max_gaussians
     budget, message = plan_budget(config.method, scene, asked, default_device(), explicit=explicit)
     if message is not None:
@@ -211,11 +192,7 @@ def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> R
 
 
 def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> TrainedRun:
-    """Trains to the end; where the GPU's memory runs out, once more from the newest checkpoint with less.
-
-    Raises:
-        UserError: Memory ran out twice.
-    """
+    """Trains to the end; if the GPU's memory runs out, once more from the newest checkpoint."""
     result = _train_unless_full(job, config, resume)
     if isinstance(result, TrainedRun):
         return result
@@ -223,25 +200,22 @@ def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> Train
     torch.cuda.empty_cache()
     budget = result.train.density.max_gaussians
     message = (
-        f"the GPU's memory ran out; going on from the newest checkpoint with at most {budget:,} Gaussians"
+        f"the GPU's memory ran out; continuing from the newest checkpoint with at most {budget:,} Gaussians"
     )
     warnings.warn(message, WildGSWarning, stacklevel=3)
     again = _train_unless_full(job, result, True)
     if isinstance(again, TrainedRun):
         return again
     raise UserError(
-        "the GPU's memory ran out again: go on with --resume and a lower --max-gaussians, or start anew with a "
+        "the GPU's memory ran out again: continue with --resume and a lower --max-gaussians, or train again with a "
         "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
     )
 
 
 def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun | RunConfig:
-    """Trains to the end, or returns the configuration to try next.
+    """Trains to the end, or returns the configuration to try next; its trainer is freed by then.
 
-    What ran out of memory is freed when this returns: nothing else holds the trainer.
-
-    Raises:
-        UserError: Memory ran out on one of several processes: the others cannot be asked to try again.
+    If memory runs out on one of several processes, that is an error: the others cannot start again.
     """
     trainer: Trainer | None = None
     try:
@@ -265,7 +239,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
     except torch.OutOfMemoryError as error:
         if job.team.size > 1:
             raise UserError(
-                "a GPU's memory ran out: go on with --resume and a lower --max-gaussians"
+                "a GPU's memory ran out: continue with --resume and a lower --max-gaussians"
             ) from error
         count = len(job.scene.points) if trainer is None else len(trainer.method.gaussians)
         budget = min(count, config.train.density.max_gaussians)
@@ -275,13 +249,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
 def _train_to_end(
     job: _Job, config: RunConfig, trainer: Trainer, observers: Sequence[Observer]
 ) -> TrainedRun:
-    """Trains what is left, recording and saving.
-
-    Only whole steps are saved: whatever else breaks off a step leaves the newest checkpoint as it was.
-
-    Raises:
-        InterruptedTrainingError: A signal came; the last step is saved.
-    """
+    """Trains the remaining steps with records and checkpoints; only whole steps are saved."""
     team, folder, execution = job.team, job.folder, job.execution
     label = f"training {config.method}" + (f" on {team.size} processes" if team.size > 1 else "")
     alignment = job.scene.alignment
@@ -319,18 +287,13 @@ def _train_to_end(
             trainer.run([recorder, *observers, show, saver, stop])
         except InterruptedTrainingError as interrupt:
             team.from_first(lambda: _save_last(saver, writer, trainer.step, hurry=True))
-            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume goes on",)
+            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume continues",)
             raise
         _save_last(saver, writer, trainer.step)
         result = replace(_result(job, config, trainer), photos=_inspect(job, trainer))
         logger.info(
-            "%s: %d steps in %.1f min on %s, %s Gaussians -> %s",
-            label,
-            result.steps,
-            result.seconds / 60,
-            result.device,
-            f"{result.num_gaussians:,}",
-            folder,
+            f"{label}: {result.steps} steps in {result.seconds / 60:.1f} min on {result.device}, "
+            f"{result.num_gaussians:,} Gaussians -> {folder}"
         )
         for line in describe_misfits(result.photos):
             logger.info("%s", line)
@@ -345,14 +308,14 @@ def _inspect(job: _Job, trainer: Trainer) -> list[PhotoFit]:
 
 
 def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:
-    """Saves the last step and returns when it is on the disk; see `Autosave.save_last`."""
+    """Saves the last step and waits until it is on the disk; see `Autosave.save_last`."""
     if not writer.finish():
         saver.saved_step = 0  # what was being written failed: the last step is to be written again
     saver.save_last(step, hurry=hurry)
 
 
 def _follow(job: _Job, config: RunConfig, trainer: Trainer) -> TrainedRun:
-    """Trains as a process other than rank 0, which alone writes and reports."""
+    """Trains on a rank other than 0, which alone writes and prints."""
     with StopOnSignal(trainer.team) as stop:
         try:
             trainer.run([stop])

@@ -1,4 +1,4 @@
-"""A look: one light on the whole scene, shaded once and then as cheap as plain 3D Gaussian Splatting."""
+"""A look: the scene under one appearance, shaded once; mixes of looks, and looks that change over time."""
 
 from __future__ import annotations
 
@@ -30,18 +30,24 @@ class Look:
         embeddings: What `mix` mixes.
         method: The trained method to which the embeddings belong.
         note: How the light was found, where that is worth a line to the user.
+        sky: The look from which the sky's colours are taken; None takes this one's.
     """
 
     name: str
     embeddings: Embeddings = field(repr=False)
     method: Method = field(repr=False)
     note: str = ""
+    sky: Look | None = field(default=None, repr=False)
 
     @cached_property
     def sh(self) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics of all Gaussians under this light, on the method's device; shaded once, then kept."""
         with torch.no_grad():
-            return self.method.fuse(self.embeddings)
+            own = self.method.fuse(self.embeddings)
+            which = None if self.sky is None else self.method.sky()
+            if self.sky is None or which is None:
+                return own
+            return torch.where(which[:, None, None], self.sky.sh, own)
 
 
 @torch.no_grad()
@@ -53,6 +59,19 @@ def look_of(method: Method, appearance: Appearance, name: str, note: str = "") -
 def own_look(method: Method) -> Look:
     """The one look of a method that is not relightable."""
     return look_of(method, Appearance(), "own light")
+
+
+def with_sky(look: Look, sky: Look) -> Look:
+    """A look with the sky of another; depth and alpha do not depend on either.
+
+    Raises:
+        UserError: The looks are of different scenes, or the method does not tell the sky from the scene.
+    """
+    _require_one_scene([look, sky])
+    if look.method.sky() is None:
+        raise UserError(f"this run of {look.method.label} has no sky apart from the scene; leave --sky out")
+    name = f"{look.name} under the sky of {sky.name}"
+    return Look(name, look.embeddings, look.method, look.note, sky.sky or sky)
 
 
 def mix(
@@ -77,15 +96,22 @@ def mix(
     if not looks:
         raise UserError("a mix needs at least one appearance")
     first = looks[0]
-    if any(look.method is not first.method for look in looks):
-        raise UserError("these appearances belong to different scenes; mix those of one loaded scene")
+    _require_one_scene(looks)
     weights = _checked(looks, weights)
     local = weights if local_weights is None else _checked(looks, local_weights)
     if not first.method.relightable:
         return first
     parts = [look.embeddings for look in looks]
     name = name or _describe(looks, weights, local)
-    return Look(name, first.method.mix(parts, weights, local), first.method)
+    sky = None
+    if any(look.sky for look in looks):
+        sky = mix([look.sky or look for look in looks], weights, local_weights=local)
+    return Look(name, first.method.mix(parts, weights, local), first.method, sky=sky)
+
+
+def _require_one_scene(looks: Sequence[Look]) -> None:
+    if any(look.method is not looks[0].method for look in looks):
+        raise UserError("these appearances belong to different scenes; mix those of one loaded scene")
 
 
 def _checked(looks: Sequence[Look], weights: Sequence[float | int]) -> list[float]:
@@ -107,3 +133,38 @@ def _describe(looks: Sequence[Look], weights: Sequence[float | int], local: Sequ
         )
 
     return sum_of(weights) if weights == local else f"global {sum_of(weights)}, local {sum_of(local)}"
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Looks at even distances over time; between two of them their mix.
+
+    Attributes:
+        looks: At least one; a single one does not change.
+    """
+
+    looks: tuple[Look, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse what shows nothing."""
+        if not self.looks:
+            raise UserError("a video needs at least one appearance")
+
+    @classmethod
+    def of(cls, looks: Look | Sequence[Look]) -> Timeline:
+        """One look, or several over time."""
+        return cls((looks,) if isinstance(looks, Look) else tuple(looks))
+
+    def at(self, share: float) -> Look:
+        """The look at a share of the time, from 0 to 1.
+
+        At the looks themselves no mixing and no new shading takes place.
+        """
+        position = min(max(share, 0.0), 1.0) * (len(self.looks) - 1)
+        index = min(int(position), max(len(self.looks) - 2, 0))
+        amount = position - index
+        if amount < 1e-9:
+            return self.looks[index]
+        if amount > 1 - 1e-9:
+            return self.looks[index + 1]
+        return mix([self.looks[index], self.looks[index + 1]], [1 - amount, amount])

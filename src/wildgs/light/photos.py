@@ -1,19 +1,21 @@
-"""The light of photos whose camera is known, and of pictures that borrow one."""
+"""Appearances of photos with a camera, of pictures that borrow one, and of all training photos together."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
-from wildgs.model.appearance import Appearance
+from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.method import Method
-from wildgs.scene import View, find_view, match_view
+from wildgs.progress import Counter
+from wildgs.scene import View
 from wildgs.scene.scene import to_unit
-
-__all__ = ["cover", "encode_photo", "encode_picture", "encode_view", "find_view", "match_view"]
 
 
 @torch.no_grad()
@@ -52,3 +54,46 @@ def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Ten
     box = (max(left, 0), max(top, 0), min(left + part[0], image.width), min(top + part[1], image.height))
     fitted = image.resize((width, height), Image.Resampling.LANCZOS, box=box)
     return torch.frombuffer(bytearray(fitted.tobytes()), dtype=torch.uint8).reshape(height, width, 3)
+
+
+MAX_PHOTOS = 200
+"""Most photos that are encoded; of larger collections as many, evenly spread over the names."""
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """The light of the training photos.
+
+    Attributes:
+        views: The photos.
+        global_embeddings: Emb^g of each.
+        mean: Mean of all embeddings and colour maps over the photos: the neutral light.
+    """
+
+    views: tuple[View, ...]
+    global_embeddings: Float[Tensor, "V G"]
+    mean: Embeddings
+
+    def most_alike(self, global_embedding: Float[Tensor, " G"]) -> View:
+        """The photo whose global embedding is nearest."""
+        distance = (self.global_embeddings - global_embedding).norm(dim=1)
+        return self.views[int(distance.argmin())]
+
+
+@torch.no_grad()
+def make_atlas(method: Method, views: Sequence[View], progress: Counter | None = None) -> Atlas:
+    """Encodes the training photos (at least one), `MAX_PHOTOS` at most."""
+    count = min(len(views), MAX_PHOTOS)
+    chosen = tuple(views[index * len(views) // count] for index in range(count))
+    global_embeddings: list[Tensor] = []
+
+    def encoded() -> Iterator[Embeddings]:
+        for number, view in enumerate(chosen, start=1):
+            embeddings = method.embed(encode_view(method, view))
+            global_embeddings.append(embeddings.global_embedding)
+            yield embeddings
+            if progress is not None:
+                progress(number, count)
+
+    mean = method.mean(encoded(), count)
+    return Atlas(chosen, torch.stack(global_embeddings), mean)

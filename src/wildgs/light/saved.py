@@ -15,11 +15,12 @@ from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
-from wildgs.model.color_match import SKY_COLUMNS
 from wildgs.model.method import Method
 
 SUFFIX = ".safetensors"
 FORMAT = "wildgs-appearance-2"
+SKY = "sky."
+"""Prefix of the tensors of the look whose sky is shown."""
 
 
 def save_look(look: Look, file: Path) -> Path:
@@ -37,11 +38,9 @@ def save_look(look: Look, file: Path) -> Path:
     if file.suffix != SUFFIX:
         raise UserError(f"{file}: appearance files end in {SUFFIX}")
     tensors = _packed(look.embeddings)
-    header = {
-        "format": FORMAT,
-        "name": look.name,
-        "run": look.method.fingerprint(),
-    }
+    if look.sky is not None:
+        tensors |= {f"{SKY}{name}": values for name, values in _packed(look.sky.embeddings).items()}
+    header = {"format": FORMAT, "name": look.name, "run": look.method.fingerprint()}
     with written_aside(file) as aside:
         aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
     return file
@@ -64,10 +63,12 @@ def load_look(method: Method, file: Path) -> Look:
         name, owner = str(header["name"]), header["run"]
         if not method.relightable or owner != method.fingerprint():
             raise UserError(
-                f"{file}: was made with another run, or another step of this one; make it anew with "
+                f"{file}: was made with another run, or another step of this one; create it again with "
                 "`wildgs appearance`"
             )
-        return Look(name, _fitting(method, tensors), method)
+        of_sky = {key.removeprefix(SKY): values for key, values in tensors.items() if key.startswith(SKY)}
+        sky = Look(f"sky of {name}", _fitting(method, of_sky), method) if of_sky else None
+        return Look(name, _fitting(method, tensors), method, sky=sky)
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
 
@@ -94,17 +95,12 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
 
 
 def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
-    """A file's embeddings for a method's Gaussians.
-
-    Raises:
-        KeyError: One is missing.
-        ValueError: They do not fit the method, or are not finite.
-    """
+    """A file's embeddings for a method's Gaussians; raises `KeyError` or `ValueError` if they do not fit."""
     device = method.gaussians.means.device
     common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
     if common.shape != (method.global_size,):
         raise ValueError("embeddings of another length")
-    if color_map.shape not in ((3, 4), (3, 4 + SKY_COLUMNS)):
+    if color_map.shape not in ((3, 4), (3, method.map_columns)):
         raise ValueError("a colour map of another shape")
     weights = tensors.get("basis_weights")
     if weights is not None and weights.shape != (method.basis_size,):

@@ -1,4 +1,4 @@
-"""Where appearance can come from: a photo of the scene, a new one, any picture, the mean, or a file."""
+"""Appearances by what a user writes: a photo of the scene, a new photo, any picture, the mean, or a file."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_file
-from wildgs.light.atlas import Atlas, make_atlas
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
-from wildgs.light.photos import encode_photo, encode_picture, encode_view
+from wildgs.light.photos import Atlas, encode_photo, encode_picture, encode_view, make_atlas
 from wildgs.light.saved import SUFFIX, load_look
 from wildgs.model.method import Method
+from wildgs.progress import Progress, counter, silent
 from wildgs.scene import Scene, View, find_view, match_view
 from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.sfm.feature_index import FeatureIndex, load_feature_index
@@ -30,29 +30,26 @@ AUTO = "auto"
 
 KEPT_LOOKS = 16
 KEPT_BYTES = 2_000_000_000
-"""Looks that are kept with their shaded harmonics, the last used: so many, and within so much memory."""
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and of how much."""
+"""Bounds on the number and memory of the last used looks, which are cached with their harmonics."""
 
 
 class LightSources:
-    """Finds the looks of one scene by what a user writes, and keeps the last few."""
+    """Finds the looks of one scene, and caches the last few."""
 
     def __init__(
-        self, method: Method, open_scene: Callable[[], Scene], landmark_cache: Path | None = None
+        self, method: Method, open_scene: Callable[[], Scene], index_cache: Path | None = None
     ) -> None:
-        """Sets up `LightSources`.
+        """Finds looks of a trained method.
 
         Args:
             method: The trained method.
             open_scene: Reads the scene when it is first needed: a saved appearance needs none.
-            landmark_cache: File that keeps what new photos are localised against.
+            index_cache: File that caches the feature index in which new photos are localised.
         """
         self.method = method
         self._open_scene = open_scene
-        self._landmark_cache = landmark_cache
-        self._landmarks: FeatureIndex | None = None
+        self._index_cache = index_cache
+        self._index: FeatureIndex | None = None
         self._kept: OrderedDict[tuple[str, str | None, tuple[int, ...]], Look] = OrderedDict()
         self._atlas: Atlas | None = None
 
@@ -76,7 +73,7 @@ class LightSources:
             spec: One of the above.
             like: The photo of the scene whose camera and depth a file borrows, or `auto` for the training photo
                 that looks most like it. None tries to localise first.
-            progress: Told about long work.
+            progress: Called during long work.
 
         Raises:
             UserError: There is no such photo or file, or it cannot be read.
@@ -88,7 +85,7 @@ class LightSources:
             return self._own
         key = (str(spec), like, _stamp(Path(spec)))
         if key not in self._kept:
-            self._kept[key] = self._make(str(spec), like, progress or _silent)
+            self._kept[key] = self._make(str(spec), like, progress or silent)
         self._kept.move_to_end(key)
         size = 4 * 3 * (self.method.sh_degree + 1) ** 2 * self.method.num_gaussians
         while len(self._kept) > max(2, min(KEPT_LOOKS, KEPT_BYTES // max(size, 1))):
@@ -127,14 +124,11 @@ class LightSources:
 
     def _locate(self, file: Path, progress: Progress) -> Look:
         """The look of a new photo of the place."""
-        if self._landmarks is None:
-            self._landmarks = load_feature_index(
-                self.scene,
-                self._landmark_cache,
-                lambda done, total: progress("finding features of the scene's photos", done, total),
-            )
+        if self._index is None:
+            show = counter(progress, "finding features of the scene's photos")
+            self._index = load_feature_index(self.scene, self._index_cache, show)
         long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
-        found = localize(file, self._landmarks, long_side)
+        found = localize(file, self._index, long_side)
         appearance = encode_photo(self.method, found.photo, found.camera)
         return look_of(self.method, appearance, file.name, found.describe())
 
@@ -153,12 +147,8 @@ class LightSources:
     def atlas(self, progress: Progress | None = None) -> Atlas:
         """The light of all training photos; made once."""
         if self._atlas is None:
-            tell = progress or _silent
-            self._atlas = make_atlas(
-                self.method,
-                self.scene.train_views,
-                lambda done, total: tell("reading the light of the photos", done, total),
-            )
+            show = counter(progress, "encoding the photos")
+            self._atlas = make_atlas(self.method, self.scene.train_views, show)
         return self._atlas
 
 
@@ -175,12 +165,8 @@ def read_picture(file: Path) -> UInt8[Tensor, "H W 3"]:
 
 
 def _stamp(file: Path) -> tuple[int, ...]:
-    """What changes when a file is written again; empty where there is no file."""
+    """Changes when a file is rewritten; empty if there is no file."""
     if not is_file(file):
         return ()
     state = file.stat()
     return state.st_ctime_ns, state.st_mtime_ns, state.st_size, state.st_ino
-
-
-def _silent(*_: object) -> None:
-    """No one is told."""

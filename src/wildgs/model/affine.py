@@ -25,18 +25,11 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.losses.photometric import masked_photometric
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.config import InitialConfig, LearningRate
-from wildgs.model.gaussians import Gaussians
+from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.method import (
-    GEOMETRY_ROWS,
-    MemoryUse,
-    Method,
-    ParameterGroup,
-    Stage,
-    TrainingOutput,
-)
-from wildgs.model.rows import paint_visible, take_rows
+from wildgs.model.method import Method
+from wildgs.model.training_pass import ParameterGroup, Stage, TrainingOutput
 from wildgs.rasterize import blend
 
 FOURIER_ENTRIES = 6
@@ -111,13 +104,7 @@ class AffineGS(Method):
     photo_keys: Int[Tensor, " P"]
 
     def __init__(self, config: AffineConfig, gaussians: Gaussians, photo_keys: Int[Tensor, " P"]) -> None:
-        """Sets up an `AffineGS`.
-
-        Args:
-            config: Sizes.
-            gaussians: With rows sh0, shN and embedding.
-            photo_keys: Identify the training photos, see `_key`.
-        """
+        """Takes Gaussians with rows sh0, shN and embedding, and the keys of the training photos (see `_key`)."""
         super().__init__()
         self.config = config
         self.gaussians = gaussians
@@ -226,17 +213,12 @@ class AffineGS(Method):
             share = step / self.config.encode_steps
             optimizer.param_groups[0]["lr"] = self.config.encode_rate * 0.5 * (1 + math.cos(math.pi * share))
             with torch.enable_grad():
-                colors = paint_visible(self, projection, Appearance(embedding), self.sh_degree)
+                colors = self.paint(projection, Appearance(embedding), self.sh_degree)
                 render = blend(projection, colors, depth=False).colors
                 loss = masked_photometric(photo, render, visibility)
                 (embedding.grad,) = torch.autograd.grad(loss, [embedding])
             optimizer.step()
         return embedding.detach()
-
-    def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
-        """The photo's embedding is all there is."""
-        assert appearance.global_embedding is not None
-        return Embeddings(appearance.global_embedding)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Base harmonics, scaled and shifted: colours ``c`` become ``scale * c + offset``."""
@@ -265,7 +247,7 @@ class AffineGS(Method):
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         appearance = Appearance(self._mean() if learnt is None else learnt)
-        colors = paint_visible(self, projection, appearance, stage.sh_degree)
+        colors = self.paint(projection, appearance, stage.sh_degree)
         return TrainingOutput(blend(projection, colors), projection, None)
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
-from wildgs.model.lifting import MIN_ALPHA, liftable
 from wildgs.model.sky import Sky
+from wildgs.model.wrapping import MIN_ALPHA, liftable
 from wildgs.rasterize import Rendering
 
 ROUNDS, TRAINING_ROUNDS = 6, 3
@@ -25,7 +25,7 @@ OUTLIER = 0.05
 LEAST_PIXELS = 64
 """Fewer say nothing about a photo's light."""
 MATCH_EVERY = 3
-
+"""Rows and columns of which one is read in training."""
 
 ELEVATION_ORDERS = 2
 """Powers of the sine of the elevation by which the sky's colours are matched: it is paler near the horizon."""
@@ -61,20 +61,25 @@ def match_colors(
     render: Float[Tensor, "H W 3"],
     photo: Float[Tensor, "H W 3"],
     weights: Float[Tensor, "H W"],
-    rounds: int = ROUNDS,
-) -> Float[Tensor, "3 4"]:
+    training: bool = False,
+    codes: Float[Tensor, "H W L"] | None = None,
+) -> Float[Tensor, "3 M"]:
     """The affine map of colours that takes a render to its photo, by robust least squares.
 
     Args:
         render: In 0..1, more where the scene is brighter than white.
         photo: In 0..1.
         weights: Of the pixels, 0 or more; 0 where something stands in the way.
-        rounds: Of reweighting.
+        training: Whether each channel has a gain of its own and no share in the others.
+        codes: Further terms; None for none.
 
     Returns:
-        Change [A | b]: colours c become ``c + A c + b``. Zero where too little of the scene is seen.
+        Change [A | b | W]: colours c become ``c + A c + b + W codes``. Zero where too little of the scene is seen.
     """
-    return _fitted(render, photo, weights, torch.ones_like(weights)[..., None], rounds)
+    further = torch.ones_like(weights)[..., None]
+    if codes is not None:
+        further = torch.cat([further, codes], dim=2)
+    return _fitted(render, photo, weights, further, training)
 
 
 @torch.no_grad()
@@ -86,6 +91,7 @@ def match_photo(
     *,
     threshold: float,
     sky: Sky | None,
+    codes: Float[Tensor, "H W L"],
     training: bool = False,
 ) -> Float[Tensor, "3 M"]:
     """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
@@ -99,10 +105,11 @@ def match_photo(
         keep: The user's own mask: pixels that are False do not count.
         threshold: Th: pixels with a visibility above it are static.
         sky: Which pixels show it; None matches all pixels alike.
-        training: Reads every third row and column, in fewer rounds.
+        codes: Rendered light codes of the landmark, on which its change depends linearly; L may be 0.
+        training: Reads every third row and column, and gives each channel a gain of its own, no more.
 
     Returns:
-        As `match_colors`; with a sky, that of `match_sky` beside it.
+        As `match_colors`, [A | b | W]; with a sky, that of `match_sky` beside it.
     """
     static = liftable(visibility, rendering.alpha, threshold)
     covered = rendering.alpha > MIN_ALPHA
@@ -110,17 +117,19 @@ def match_photo(
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
     some = (slice(MATCH_EVERY // 2, None, MATCH_EVERY) if training else slice(None),) * 2
-    rounds = TRAINING_ROUNDS if training else ROUNDS
     colors, photo, weights = rendering.colors[some], photo[some], weights[some]
     if sky is None:
-        return match_colors(colors, photo, weights, rounds)
-    own = match_colors(colors, photo, weights * ~sky.which[some], rounds)
-    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], rounds)
+        return match_colors(colors, photo, weights, training, codes[some])
+    own = match_colors(colors, photo, weights * ~sky.which[some], training, codes[some])
+    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], training)
     return torch.cat([own, of_sky], dim=1)
 
 
 def changed_harmonics(
-    harmonics: Float[Tensor, "V K 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+    harmonics: Float[Tensor, "V K 3"],
+    change: Float[Tensor, "3 M"],
+    sky: Sky | None,
+    codes: Float[Tensor, "V L"],
 ) -> Float[Tensor, "V K 3"]:
     """The harmonics of changed colours.
 
@@ -128,24 +137,34 @@ def changed_harmonics(
         harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
         change: From `match_photo`.
         sky: Which Gaussians stand for it; None as in `match_photo`.
+        codes: Their light codes.
     """
+    own, by_code, of_sky, by_elevation = _split(change, codes.shape[1])
+    below = mapped(harmonics, own, codes @ by_code.T)
     if sky is None:
-        return mapped(harmonics, change)
-    own, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+        return below
     above = mapped(harmonics, of_sky, elevation_powers(sky.sine) @ by_elevation.T)
-    return torch.where(sky.which[:, None, None], above, mapped(harmonics, own))
+    return torch.where(sky.which[:, None, None], above, below)
 
 
 def changed_picture(
-    render: Float[Tensor, "H W 3"], change: Float[Tensor, "3 M"], sky: Sky | None
+    render: Float[Tensor, "H W 3"],
+    change: Float[Tensor, "3 M"],
+    sky: Sky | None,
+    codes: Float[Tensor, "H W L"],
 ) -> Float[Tensor, "H W 3"]:
     """A render of changed colours, pixel by pixel; see `changed_harmonics`."""
-    own = render + render @ change[:, :3].T + change[:, 3]
+    own, by_code, of_sky, by_elevation = _split(change, codes.shape[2])
+    below = render + render @ own[:, :3].T + own[:, 3] + codes @ by_code.T
     if sky is None:
-        return own
-    _, of_sky, by_elevation = change.tensor_split((4, 8), dim=1)
+        return below
     above = render + render @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
-    return torch.where(sky.which[..., None], above, own)
+    return torch.where(sky.which[..., None], above, below)
+
+
+def _split(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
+    """[A | b] of the landmark and what its codes change, the same of the sky and its elevation."""
+    return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)
 
 
 @torch.no_grad()
@@ -154,7 +173,7 @@ def match_sky(
     photo: Float[Tensor, "H W 3"],
     weights: Float[Tensor, "H W"],
     sine: Float[Tensor, "H W"],
-    rounds: int = ROUNDS,
+    training: bool = False,
 ) -> Float[Tensor, "3 M"]:
     """As `match_colors`, for the sky: the change may vary smoothly with the elevation.
 
@@ -163,34 +182,43 @@ def match_sky(
         photo: In 0..1.
         weights: Of the pixels; 0 where there is no sky.
         sine: Of the elevation at which a pixel shows the sky.
-        rounds: Of reweighting.
+        training: Whether each channel has a gain of its own and no share in the others.
 
     Returns:
         Change [A | b | E]: colours c become ``c + A c + b + E @ elevation_powers(sine)``.
     """
     further = torch.cat([torch.ones_like(sine)[..., None], elevation_powers(sine)], dim=-1)
-    return _fitted(render, photo, weights, further, rounds)
+    return _fitted(render, photo, weights, further, training)
 
 
 def _fitted(
-    render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"], rounds: int
-) -> Tensor:
+    render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"], training: bool
+) -> Float[Tensor, "3 M"]:
     """Robust least squares of the photo's difference from the render by the render's colours and further terms.
+
+    In training each channel has a gain of its own and no share in the others. With all nine numbers, training lost
+    the colours of materials: errors of the render weaken what the fit makes of a hue, which then is not learnt.
 
     Nothing in it waits for a GPU: pixels that do not count are weighted, not selected.
     """
-    counts = (weights > 0).reshape(-1, 1)
-    base = torch.where(counts, weights.reshape(-1, 1), 0).double()
-    colors = torch.where(counts, render.reshape(-1, 3).clamp(0, 1), 0).double()
-    residual = torch.where(counts, photo.reshape(-1, 3), 0).double() - colors
-    terms = torch.cat([colors, further.reshape(len(colors), -1).double()], dim=1)
-    columns = terms.shape[1]
-    ridge = RIDGE * torch.eye(columns, dtype=terms.dtype, device=terms.device)
-    change, trusted = terms.new_zeros(columns, 3), base
-    for _ in range(rounds):
-        weighted = terms * (trusted / trusted.sum())
-        change = torch.linalg.solve_ex(weighted.T @ terms + ridge, weighted.T @ residual).result
-        error = (residual - terms @ change).abs().mean(dim=1, keepdim=True)
+    counts = (weights > 0).reshape(-1)
+    base = torch.where(counts, weights.reshape(-1), 0).double()
+    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(0, 1), 0).double()
+    residual = torch.where(counts[:, None], photo.reshape(-1, 3), 0).double() - colors
+    further = further.reshape(len(colors), -1).double()
+    # A leading axis of problems: one of three channels, or one for each channel.
+    if training:
+        terms = torch.cat([colors.T[..., None], further.expand(3, -1, -1)], dim=2)
+        residual = residual.T[..., None]
+    else:
+        terms, residual = torch.cat([colors, further], dim=1)[None], residual[None]
+    ridge = RIDGE * torch.eye(terms.shape[2], dtype=terms.dtype, device=terms.device)
+    change, trusted = terms.new_zeros(()), base
+    for _ in range(TRAINING_ROUNDS if training else ROUNDS):
+        weighted = terms.mT * (trusted / trusted.sum())
+        change = torch.linalg.solve_ex(weighted @ terms + ridge, weighted @ residual).result
+        error = (residual - terms @ change).abs().mean(dim=(0, 2))
         trusted = base * OUTLIER**2 / (OUTLIER**2 + error.square())
-    usable = change.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
-    return torch.where(usable, change.T.float(), 0).contiguous()
+    found = torch.cat([change[:, 0, 0].diag(), change[:, 1:, 0]], dim=1) if training else change[0].T
+    usable = found.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
+    return torch.where(usable, found.float(), 0).contiguous()

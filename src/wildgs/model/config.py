@@ -179,6 +179,22 @@ class LearningRate:
 
 
 @dataclass(frozen=True)
+class MemoryUse:
+    """What training a method takes beside the decoded photos, bytes; `benchmarks/memory.py` measures it.
+
+    Attributes:
+        per_gaussian: Parameters, gradients, Adam's moments, the copies of densification, and the intermediate
+            values of one view.
+        per_pixel: Of the largest photo, at the size at which it trains.
+        fixed: Networks with their moments and activations, and compiled kernels.
+    """
+
+    per_gaussian: int
+    per_pixel: int
+    fixed: int
+
+
+@dataclass(frozen=True)
 class WildGSRates:
     """Learning rates of what plain 3DGS does not have.
 
@@ -213,6 +229,8 @@ class WildGSConfig:
             scene's colours under that are from the photo's. Not in the paper.
         matched_loss: How much of the colour match a training render gets before it is compared with its photo, from
             0 to 1. Not in the paper.
+        light_codes: Numbers per Gaussian, linear in f^in, with which a photo's change of colours may vary over the
+            landmark; 0 for none. Not in the paper.
         light_components: Size of the basis of lights in which a photo's light is fitted after the colour match
             (`wildgs.model.light_basis`); 0 for none. Not in the paper.
         learning_rates: Of networks and intrinsic features.
@@ -228,6 +246,7 @@ class WildGSConfig:
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
     matched_loss: float = 1.0
+    light_codes: int = 3
     light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 

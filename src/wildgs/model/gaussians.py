@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
@@ -14,6 +16,15 @@ INITIAL_OPACITY = 0.1
 NEAR = 0.05
 """Near plane; the aligned frame's unit is the photos' median depth. What people in the way leave behind floats
 right before single cameras: nearer than this there is nothing of a landmark to see."""
+
+
+GEOMETRY_ROWS: dict[str, tuple[int, ...]] = {
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (3,),
+    "opacity_logits": (),
+}
+"""Rows that every method has, with the shape of one Gaussian's entry."""
 
 
 class Gaussians(nn.Module):
@@ -27,11 +38,7 @@ class Gaussians(nn.Module):
     """
 
     def __init__(self, rows: dict[str, Tensor]) -> None:
-        """Sets up a `Gaussians`.
-
-        Args:
-            rows: Initial values; must hold means, quats, log_scales and opacity_logits.
-        """
+        """Takes the initial values of all rows, `GEOMETRY_ROWS` among them."""
         super().__init__()
         self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})
 
@@ -91,6 +98,37 @@ def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
     }
 
 
-def colors_to_unit(colors: UInt8[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-    """8-bit colours as floats in [0, 1]."""
-    return colors.float() / 255.0
+ROWS_STEP = 1024
+"""Rows are shaded in multiples of this on the CPU, where libraries compile a matrix product for every new shape."""
+
+
+def rows_to_shade(visible: Bool[Tensor, "N"]) -> Int[Tensor, " V"]:
+    """Indices of the visible Gaussians; on the CPU also of a few others, up to a multiple of `ROWS_STEP`."""
+    rows = visible.nonzero()[:, 0]
+    if visible.device.type != "cpu":
+        return rows
+    missing = min(-len(rows) % ROWS_STEP, len(visible) - len(rows))
+    if missing == 0:
+        return rows
+    return torch.cat([rows, (~visible).nonzero()[:missing, 0]])
+
+
+def take_rows(values: Float[Tensor, "N *rest"], rows: Int[Tensor, " V"]) -> Float[Tensor, "V *rest"]:
+    """``values[rows]`` for indices of which none comes twice.
+
+    Its gradient is then written, not added up: indexing would sort the indices on a GPU to add in a fixed order.
+    """
+    return _TakeRows.apply(values, rows)
+
+
+class _TakeRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rows: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.save_for_backward(rows)
+        ctx.count = len(values)
+        return values.index_select(0, rows)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (rows,) = ctx.saved_tensors
+        return gradient.new_zeros(ctx.count, *gradient.shape[1:]).index_copy_(0, rows, gradient), None

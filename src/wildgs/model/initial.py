@@ -12,7 +12,7 @@ from torch import Tensor
 
 from wildgs.errors import WildGSWarning
 from wildgs.model.config import InitialConfig, SkyConfig
-from wildgs.model.gaussians import colors_to_unit, geometry_from_points
+from wildgs.model.gaussians import geometry_from_points
 from wildgs.model.sky import COLOR as SKY_COLOR
 from wildgs.model.sky import sky_points
 from wildgs.priors.depth_points import depth_points
@@ -118,16 +118,16 @@ def initial_from_points(
     surface, painted = points, colors
     if dense is not None:
         surface, painted = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
-    parts = [(geometry_from_points(surface), colors_to_unit(painted))]
+    parts = [(geometry_from_points(surface), painted.float() / 255)]
     if ground is not None:
-        parts.append((ground_rows(ground[0], config.ground.spacing), colors_to_unit(ground[1])))
+        parts.append((ground_rows(ground[0], config.ground.spacing), ground[1].float() / 255))
     if config.sky.points:
         parts.append((sky_rows(config.sky, points), torch.full((config.sky.points, 3), SKY_COLOR)))
     return InitialGaussians(
         rows={name: torch.cat([rows[name] for rows, _ in parts]) for name in parts[0][0]},
         colors=torch.cat([unit for _, unit in parts]),
         points=points,
-        point_colors=colors_to_unit(colors),
+        point_colors=colors.float() / 255,
         photos=tuple(photos),
     )
 
@@ -138,9 +138,6 @@ def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tenso
     Args:
         points: Their centres in the aligned frame, +z up.
         spacing: Distance between neighbours, world units.
-
-    Returns:
-        Rows as `wildgs.model.gaussians.geometry_from_points` gives them.
     """
     count = len(points)
     scales = spacing * torch.tensor([GROUND_WIDTH, GROUND_WIDTH, GROUND_THICKNESS])
@@ -153,15 +150,7 @@ def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tenso
 
 
 def sky_rows(config: SkyConfig, points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
-    """Geometry of the sky's Gaussians: round, and as wide as their neighbours are far.
-
-    Args:
-        config: The shell.
-        points: The scene's SfM points in the aligned frame, +z up.
-
-    Returns:
-        Rows as `wildgs.model.gaussians.geometry_from_points` gives them.
-    """
+    """Geometry of the sky's Gaussians, round and as wide as their spacing, around the scene's SfM points."""
     rows = geometry_from_points(sky_points(config, points))
     rows["opacity_logits"] = torch.full((config.points,), config.opacity).logit()
     return rows

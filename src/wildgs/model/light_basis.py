@@ -20,9 +20,8 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.lifting import liftable
 from wildgs.model.method import Method
-from wildgs.model.rows import paint_visible
+from wildgs.model.wrapping import liftable
 from wildgs.rasterize import Projection, blend
 
 MOST_LIGHTS = 96
@@ -126,7 +125,7 @@ class LightBasis(nn.Module):
         height, width = (max(1, round(side * scale)) for side in photo.shape[:2])
         camera = camera.resized(width, height)
         projection = method.gaussians.project(camera)
-        rendering = blend(projection, paint_visible(method, projection, appearance, method.sh_degree))
+        rendering = blend(projection, method.paint(projection, appearance, method.sh_degree))
         visibility = None if appearance.visibility is None else _resized(appearance.visibility, height, width)
         counts = liftable(visibility, rendering.alpha, method.mask_threshold).float()
         if visibility is not None:

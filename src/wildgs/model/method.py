@@ -8,106 +8,19 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, mean_embeddings
-from wildgs.model.config import InitialConfig, LearningRate
-from wildgs.model.gaussians import Gaussians
+from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
+from wildgs.model.gaussians import Gaussians, rows_to_shade, take_rows
 from wildgs.model.initial import InitialGaussians, initial_from_points
+from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
-
-GEOMETRY_ROWS: dict[str, tuple[int, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "log_scales": (3,),
-    "opacity_logits": (),
-}
-"""Rows that every method has, with the shape of one Gaussian's entry."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """The state of the training schedule that a method's forward pass depends on.
-
-    Attributes:
-        explicit: Whether local appearance (the triplane) is on: off in the paper's first stage.
-        learn_mask: Whether the visibility mask takes gradients now.
-        sh_degree: Active degree of the spherical harmonics.
-        learn_encoder: Whether the photo's encoder takes gradients now.
-    """
-
-    explicit: bool = True
-    learn_mask: bool = True
-    sh_degree: int = 3
-    learn_encoder: bool = True
-
-
-@dataclass(frozen=True)
-class TrainingOutput:
-    """One training view's forward pass.
-
-    Attributes:
-        rendering: Colours, expected depth and alpha.
-        projection: Its screen statistics feed densification.
-        visibility: M, or None for a method without a mask.
-    """
-
-    rendering: Rendering
-    projection: Projection
-    visibility: Float[Tensor, "H W"] | None
-
-
-@dataclass(frozen=True)
-class ParameterGroup:
-    """Network parameters that share a learning rate.
-
-    Attributes:
-        name: Unique among the groups of a method.
-        parameters: Not rows of the Gaussians: those have `Method.row_rates`.
-        rate: Their learning rate.
-    """
-
-    name: str
-    parameters: list[nn.Parameter]
-    rate: LearningRate
-
-
-@dataclass(frozen=True)
-class MemoryUse:
-    """What training a method takes beside the decoded photos, bytes; `benchmarks/memory.py` measures it.
-
-    Attributes:
-        per_gaussian: Parameters, gradients, Adam's moments, the copies of densification, and the intermediate
-            values of one view.
-        per_pixel: Of the largest photo, at the size at which it trains.
-        fixed: Networks with their moments and activations, and compiled kernels.
-    """
-
-    per_gaussian: int
-    per_pixel: int
-    fixed: int
-
-
-@dataclass(frozen=True)
-class SeenPhoto:
-    """A training photo, as `Method.finish` gets it.
-
-    Attributes:
-        photo: RGB in [0, 1].
-        camera: Its camera, of the photo's size.
-        keep: The user's own mask: pixels that are False are not read.
-        name: The photo's.
-    """
-
-    photo: Float[Tensor, "H W 3"]
-    camera: Camera
-    keep: Bool[Tensor, "H W"] | None
-    name: str
 
 
 class Method(nn.Module, ABC):
@@ -143,6 +56,11 @@ class Method(nn.Module, ABC):
     depth_supervised: bool = False
 
     @property
+    def map_columns(self) -> int:
+        """Columns of a colour map."""
+        return 4
+
+    @property
     def basis_size(self) -> int:
         """Number of basis weights of an appearance; 0 for a method that fits none."""
         return 0
@@ -162,36 +80,21 @@ class Method(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def create(cls, config: Any, initial: InitialGaussians) -> Method:
-        """A method at its start.
-
-        Args:
-            config: An instance of `Config`.
-            initial: The first Gaussians, and the scene's points and photos.
-        """
+        """A method at its start, on the first Gaussians and with the scene's points and photos."""
 
     @classmethod
     @abstractmethod
     def blank(cls, config: Any, gaussians: Gaussians, state: Mapping[str, Tensor]) -> Method:
         """A method into which a checkpoint's tensors are loaded next; reads no pretrained weights.
 
-        Args:
-            config: An instance of `Config`.
-            gaussians: With the checkpoint's rows.
-            state: All of the checkpoint's tensors, for shapes that neither `config` nor `gaussians` determine.
+        `gaussians` have the checkpoint's rows; `state` holds all its tensors, for shapes that only they determine.
         """
 
     @classmethod
     def from_points(
         cls, config: Any, points: Float[Tensor, "P 3"], colors: UInt8[Tensor, "P 3"], **options: Any
     ) -> Method:
-        """A method at its start on SfM points, without priors and budget.
-
-        Args:
-            config: An instance of `Config`.
-            points: In the scene's aligned frame.
-            colors: Their 8-bit colours.
-            options: Passed to `create`.
-        """
+        """A method at its start on SfM points (aligned frame, 8-bit colours), without priors and budget."""
         return cls.create(config, initial_from_points(cls.initial(config), points, colors), **options)
 
     @abstractmethod
@@ -206,6 +109,10 @@ class Method(nn.Module, ABC):
     def num_gaussians(self) -> int:
         """N."""
         return len(self.gaussians)
+
+    def sky(self) -> Bool[Tensor, " N"] | None:
+        """Which Gaussians stand for the sky; None where the method does not tell."""
+        return None
 
     def growable(self) -> Bool[Tensor, " N"] | None:
         """Which Gaussians densification may clone and split; None for all."""
@@ -224,7 +131,6 @@ class Method(nn.Module, ABC):
             count: How many there are.
         """
 
-    @abstractmethod
     def encode(
         self,
         photo: Float[Tensor, "H W 3"],
@@ -235,7 +141,7 @@ class Method(nn.Module, ABC):
         trust_mask: bool = True,
         explicit: bool = True,
     ) -> Appearance:
-        """Reads the appearance of a photo.
+        """Reads the appearance of a photo; by default none, for a method that is not relightable.
 
         Args:
             photo: RGB in [0, 1].
@@ -247,19 +153,21 @@ class Method(nn.Module, ABC):
                 are no photo of the place: there is nobody in the way, and everything is unusual.
             explicit: Whether local appearance is read; False gives what the first stage of training has.
         """
+        return Appearance()
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
         """M of a photo (RGB in [0, 1]) and nothing else of `encode`; None for a method without a mask."""
         return None
 
-    @abstractmethod
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
-        """Carries an appearance to the Gaussians.
+        """Carries an appearance to the Gaussians; by default the global embedding is all there is.
 
         Args:
-            appearance: From `encode`; `Appearance()` for a method that is not relightable.
+            appearance: From `encode`.
             rows: Indices of the Gaussians; None for all.
         """
+        embedding = appearance.global_embedding
+        return Embeddings(self.gaussians.means.new_zeros(0) if embedding is None else embedding)
 
     @abstractmethod
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
@@ -301,7 +209,14 @@ class Method(nn.Module, ABC):
                 digest.update(state[key].detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:32]
 
-    @abstractmethod
+    def paint(self, projection: Projection, appearance: Appearance, sh_degree: int) -> Float[Tensor, "N 3"]:
+        """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded."""
+        means = self.gaussians.means
+        rows = rows_to_shade(projection.visible)
+        sh = self.shade(appearance, rows)
+        seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
+        return torch.zeros_like(means).index_copy(0, rows, seen)
+
     def training_pass(
         self,
         photo: Float[Tensor, "H W 3"],
@@ -311,7 +226,7 @@ class Method(nn.Module, ABC):
         *,
         name: str | None = None,
     ) -> TrainingOutput:
-        """Renders a training photo under its own appearance, with gradients.
+        """Renders a training photo under its own appearance, with gradients; by default under that of `encode`.
 
         Args:
             photo: RGB in [0, 1].
@@ -320,6 +235,10 @@ class Method(nn.Module, ABC):
             keep: The user's own mask: pixels that are False are not read.
             name: The photo's, by which a method may keep what it learnt or computed of it.
         """
+        projection = self.gaussians.project(camera)
+        projection.means2d.retain_grad()
+        colors = self.paint(projection, self.encode(photo, camera, keep, name=name), stage.sh_degree)
+        return TrainingOutput(blend(projection, colors), projection, None)
 
     def render(
         self,

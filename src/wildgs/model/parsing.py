@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -12,9 +13,54 @@ from torch.nn import functional
 
 from wildgs.model.config import ParsingConfig
 from wildgs.model.encoder import Encoder, SqueezeNetEncoder, load_encoder
-from wildgs.model.feature_cache import FeatureCache, pack, unpack
 from wildgs.model.precision import MixedModule
 from wildgs.model.unet import LEAST_SPREAD, UpBlock, standardize_output
+
+Shapes = tuple[tuple[int, ...], ...]
+Packed = tuple[Tensor, Shapes]
+
+
+def pack(tensors: Sequence[Tensor]) -> Packed:
+    """Tensors of one dtype, flattened and joined, with their shapes."""
+    return torch.cat([tensor.flatten() for tensor in tensors]), tuple(tuple(t.shape) for t in tensors)
+
+
+def unpack(joined: Tensor, shapes: Shapes) -> list[Tensor]:
+    """The tensors that `pack` joined, as views."""
+    parts = joined.split([math.prod(shape) for shape in shapes])
+    return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+class FeatureCache:
+    """Keeps the features of the first photos that fit.
+
+    Photos train in shuffled rounds, in which dropping what was used longest ago would drop nearly everything just
+    before its turn.
+
+    Attributes:
+        limit: Bytes.
+        num_bytes: Bytes of the features held now.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.num_bytes = 0
+        self._kept: dict[Hashable, Packed] = {}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def get(self, key: Hashable) -> Packed | None:
+        """Features, or None where they were not kept."""
+        return self._kept.get(key)
+
+    def put(self, key: Hashable, features: Packed) -> None:
+        """Keeps features if there is room for them."""
+        size = features[0].nbytes
+        if key not in self._kept and self.num_bytes + size <= self.limit:
+            self._kept[key] = features
+            self.num_bytes += size
+
 
 CALIBRATION_SIDE = 224
 SIDE_STEP = 32
@@ -58,12 +104,7 @@ class Parsing(MixedModule):
     feature_cache: FeatureCache | None = None
 
     def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
-        """Sets up a `Parsing`.
-
-        Args:
-            config: Sizes and sources.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Takes the encoder that `config` names, unless another one is given."""
         super().__init__()
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
@@ -125,9 +166,7 @@ class Parsing(MixedModule):
             features = self.encoder(image)
         return self._decode(features, self._summary(image, features[-1]), learn_mask)
 
-    def _frozen_features(
-        self, photo: Float[Tensor, "H W 3"], name: str | None
-    ) -> tuple[Tensor, tuple[tuple[int, ...], ...]]:
+    def _frozen_features(self, photo: Float[Tensor, "H W 3"], name: str | None) -> Packed:
         """A frozen encoder's features and the colour statistics of a photo, as one tensor, and their shapes."""
         assert isinstance(self.encoder, SqueezeNetEncoder)
         key = None if name is None else (name, *photo.shape[:2])
@@ -140,7 +179,7 @@ class Parsing(MixedModule):
         return found
 
     def _after_frozen(
-        self, packed: Tensor, shapes: tuple[tuple[int, ...], ...], learn_mask: bool
+        self, packed: Tensor, shapes: Shapes, learn_mask: bool
     ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
         """As `_networks`, from `_frozen_features`."""
         assert isinstance(self.encoder, SqueezeNetEncoder)

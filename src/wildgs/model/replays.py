@@ -99,7 +99,7 @@ class Replays:
             self.switch(False)
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             warnings.warn(
-                f"CUDA graphs cannot be used here ({reason}); training goes on without, a little slower",
+                f"CUDA graphs cannot be used here ({reason}); training continues without, a little slower",
                 WildGSWarning,
                 stacklevel=2,
             )

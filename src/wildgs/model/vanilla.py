@@ -6,24 +6,15 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
-from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.config import LearningRate, VanillaConfig
-from wildgs.model.gaussians import Gaussians
+from wildgs.model.appearance import Embeddings
+from wildgs.model.config import LearningRate, MemoryUse, VanillaConfig
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.method import (
-    GEOMETRY_ROWS,
-    MemoryUse,
-    Method,
-    Stage,
-    TrainingOutput,
-)
-from wildgs.model.rows import paint_visible, take_rows
-from wildgs.rasterize import blend
+from wildgs.model.method import Method
 
 SH_DEGREE = 3
 
@@ -60,7 +51,7 @@ class VanillaGS(Method):
 
     @classmethod
     def blank(cls, config: VanillaConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> VanillaGS:
-        """The Gaussians are all there is."""
+        """The Gaussians hold everything."""
         return cls(config, gaussians)
 
     def row_rates(self) -> dict[str, LearningRate]:
@@ -68,40 +59,8 @@ class VanillaGS(Method):
         rates = self.config.learning_rates
         return {"sh0": LearningRate(rates.sh0), "shN": LearningRate(rates.shN)}
 
-    def encode(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        camera: Camera,
-        keep: Bool[Tensor, "H W"] | None = None,
-        *,
-        name: str | None = None,
-        trust_mask: bool = True,
-        explicit: bool = True,
-    ) -> Appearance:
-        """Nothing: this method knows one light only."""
-        return Appearance()
-
-    def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
-        """An empty embedding."""
-        return Embeddings(self.gaussians.means.new_zeros(0))
-
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """The stored harmonics."""
         stored = self.gaussians.rows
         parts = [stored["sh0"], stored["shN"]]
         return torch.cat(parts if rows is None else [take_rows(part, rows) for part in parts], dim=1)
-
-    def training_pass(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        camera: Camera,
-        stage: Stage,
-        keep: Bool[Tensor, "H W"] | None = None,
-        *,
-        name: str | None = None,
-    ) -> TrainingOutput:
-        """Renders the camera's view; the photo plays no part."""
-        projection = self.gaussians.project(camera)
-        projection.means2d.retain_grad()
-        colors = paint_visible(self, projection, Appearance(), stage.sh_degree)
-        return TrainingOutput(blend(projection, colors), projection, None)

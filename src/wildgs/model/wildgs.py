@@ -12,29 +12,19 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import changed_harmonics, changed_picture, match_photo
-from wildgs.model.config import Ablation, InitialConfig, LearningRate, WildGSConfig
+from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
-from wildgs.model.gaussians import Gaussians
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
 from wildgs.model.initial import InitialGaussians
-from wildgs.model.lifting import lift, liftable, random_part
 from wildgs.model.light_basis import LightBasis
-from wildgs.model.method import (
-    GEOMETRY_ROWS,
-    MemoryUse,
-    Method,
-    ParameterGroup,
-    SeenPhoto,
-    Stage,
-    TrainingOutput,
-)
+from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
-from wildgs.model.rows import paint_visible, take_rows
-from wildgs.model.sky import Sky, find_sky
+from wildgs.model.photo_match import PhotoMatch
+from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
-from wildgs.model.wrapping import Wrapping
-from wildgs.rasterize import Projection, Rendering, blend
+from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
+from wildgs.rasterize import Projection, blend
 
 
 class WildGS(Method):
@@ -49,14 +39,7 @@ class WildGS(Method):
     def __init__(
         self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
     ) -> None:
-        """Sets up a `WildGS`.
-
-        Args:
-            config: The model's configuration.
-            gaussians: With a row `intrinsic` beside the geometry.
-            box: What the triplane covers.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Takes Gaussians with a row `intrinsic`, the triplane's box, and an encoder if not the one configured."""
         super().__init__()
         self.config = config
         self.gaussians = gaussians
@@ -69,6 +52,7 @@ class WildGS(Method):
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
         self.light_basis = LightBasis()
+        self.photo_match = PhotoMatch(config)
 
     @classmethod
     def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
@@ -84,13 +68,7 @@ class WildGS(Method):
     def create(
         cls, config: WildGSConfig, initial: InitialGaussians, encoder: Encoder | None = None
     ) -> WildGS:
-        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points.
-
-        Args:
-            config: The model's configuration.
-            initial: The first Gaussians.
-            encoder: Overrides the encoder that `config` names.
-        """
+        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points."""
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(initial.points, config.wrapping.box_quantile, ratio)
         intrinsic = torch.zeros(len(initial.colors), config.fusion.intrinsic_size)
@@ -105,13 +83,20 @@ class WildGS(Method):
         """With a fresh encoder and any box."""
         box = Box(torch.zeros(3), torch.ones(3))
         model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
+        if "photo_match.codes.weight" not in state:  # of an earlier version
+            model.photo_match.codes = None
         model.light_basis.components = state.get("light_basis.components")
         return model
 
     def growable(self) -> Bool[Tensor, " N"] | None:
         """All but the sky, unless configured."""
-        sky = None if self.config.sky.densify else self._find_sky(self.gaussians.means)
-        return None if sky is None else ~sky.which
+        sky = None if self.config.sky.densify else self.sky()
+        return None if sky is None else ~sky
+
+    def sky(self) -> Bool[Tensor, " N"] | None:
+        """Those far from the scene; see `wildgs.model.sky.find_sky`."""
+        sky = self.photo_match.sky(self.gaussians.means, self._centre)
+        return None if sky is None else sky.which
 
     def row_rates(self) -> dict[str, LearningRate]:
         """That of f^in."""
@@ -131,7 +116,12 @@ class WildGS(Method):
 
     def appearance_parameters(self) -> tuple[str, ...]:
         """The centres, at which planes are sampled, the fusion network and the basis of lights."""
-        return ("fusion.", "gaussians.rows.means", "light_basis.")
+        return ("fusion.", "gaussians.rows.means", "light_basis.", "photo_match.")
+
+    @property
+    def map_columns(self) -> int:
+        """Those of `PhotoMatch`."""
+        return self.photo_match.columns
 
     @property
     def basis_size(self) -> int:
@@ -181,29 +171,19 @@ class WildGS(Method):
         if not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, keep)
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
-        if self.config.color_match and trust_mask:
-            appearance = self._match(photo, appearance, projection, keep)
-            appearance = self.light_basis.fit(self, photo, appearance, camera, keep)
-        return appearance
+        if not (self.config.color_match and trust_mask):
+            return appearance
+        intrinsic = self.gaussians.rows["intrinsic"]
+        with torch.no_grad():
+            colors = self.paint(projection, appearance, self.sh_degree)
+            change = self.photo_match.find(
+                photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
+            )
+        return self.light_basis.fit(self, photo, replace(appearance, color_map=change), camera, keep)
 
-    @torch.no_grad()
-    def _match(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        appearance: Appearance,
-        projection: Projection,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Appearance:
-        """Adds what the appearance's own render of the photo is off by."""
-        rendering = blend(projection, paint_visible(self, projection, appearance, self.sh_degree))
-        sky = self._find_sky(projection.camera.unproject(rendering.depth))
-        change = match_photo(
-            photo, rendering, appearance.visibility, keep, threshold=self.mask_threshold, sky=sky
-        )
-        return replace(appearance, color_map=change)
-
-    def _find_sky(self, points: Float[Tensor, "*batch 3"]) -> Sky | None:
-        return find_sky(self.config.sky, points.detach(), (self.wrapping.low + self.wrapping.high) / 2)
+    @property
+    def _centre(self) -> Float[Tensor, " 3"]:
+        return (self.wrapping.low + self.wrapping.high) / 2
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
         """M, by 2D Parsing alone."""
@@ -286,9 +266,9 @@ class WildGS(Method):
         )
         if change is None or change.shape[1] == 4:
             return self.fusion(common, local, intrinsic, change)
-        means = self.gaussians.means
-        sky = self._find_sky(means if rows is None else means[rows])
-        return changed_harmonics(self.fusion(common, local, intrinsic), change, sky)
+        means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
+        harmonics = self.fusion(common, local, intrinsic)
+        return self.photo_match.harmonics(harmonics, change, means, intrinsic, self._centre)
 
     def training_pass(
         self,
@@ -307,24 +287,9 @@ class WildGS(Method):
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
-        colors = paint_visible(self, projection, appearance, stage.sh_degree)
-        rendering = blend(projection, colors)
-        if self.config.color_match and self.config.matched_loss:
-            rendering = self._matched(photo, rendering, appearance.visibility, camera, keep)
+        colors = self.paint(projection, appearance, stage.sh_degree)
+        intrinsic = self.gaussians.rows["intrinsic"]
+        rendering = self.photo_match.training_render(
+            photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
+        )
         return TrainingOutput(rendering, projection, appearance.visibility)
-
-    def _matched(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        rendering: Rendering,
-        visibility: Float[Tensor, "H W"] | None,
-        camera: Camera,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Rendering:
-        """The render as `encode`'s colour match would leave it; no gradient reaches the match itself."""
-        with torch.no_grad():
-            sky = self._find_sky(camera.unproject(rendering.depth))
-            change = self.config.matched_loss * match_photo(
-                photo, rendering, visibility, keep, threshold=self.mask_threshold, sky=sky, training=True
-            )
-        return replace(rendering, colors=changed_picture(rendering.colors, change, sky))

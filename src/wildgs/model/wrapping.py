@@ -1,4 +1,4 @@
-"""3D Wrapping (paper, figure 2 right): the local appearance embedding of every Gaussian."""
+"""3D Wrapping (paper, figure 2 right): pixels lifted to a cloud, the triplane, and local embeddings."""
 
 from __future__ import annotations
 
@@ -6,11 +6,46 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from wildgs.geometry.camera import Camera
 from wildgs.model.config import WrappingConfig
+from wildgs.model.gaussians import rows_to_shade
 from wildgs.model.precision import MixedModule
-from wildgs.model.rows import rows_to_shade
 from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_planes
 from wildgs.model.unet import UNet, standardize_output
+
+MIN_ALPHA = 0.5
+"""Rendered depth means something only where the Gaussians cover a pixel."""
+
+
+def liftable(
+    visibility: Float[Tensor, "H W"] | None, alpha: Float[Tensor, "H W"], threshold: float
+) -> Bool[Tensor, "H W"]:
+    """Pixels that may be lifted: static (M > Th) and covered by Gaussians."""
+    covered = alpha > MIN_ALPHA
+    return covered if visibility is None else covered & (visibility > threshold)
+
+
+def random_part(height: int, width: int, device: torch.device | str = "cpu") -> Bool[Tensor, "H W"]:
+    """What lies on one side of a straight cut, upright or level, through the middle half of a picture."""
+    place, upright, kept_first = torch.rand(3).tolist()
+    length = width if upright < 0.5 else height
+    first = torch.arange(length, device=device) < round((0.25 + 0.5 * place) * length)
+    chosen = first if kept_first < 0.5 else ~first
+    return (chosen[None, :] if upright < 0.5 else chosen[:, None]).expand(height, width)
+
+
+@torch.no_grad()
+def lift(
+    photo: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], camera: Camera
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
+    """BP: all pixels as world points P and their colours C, row by row.
+
+    Args:
+        photo: RGB in [0, 1].
+        depth: Expected depth along the camera's z axis, world units.
+        camera: The photo's camera.
+    """
+    return camera.unproject(depth).reshape(-1, 3), photo.reshape(-1, 3)
 
 
 class Wrapping(MixedModule):
@@ -20,13 +55,7 @@ class Wrapping(MixedModule):
     high: Tensor
 
     def __init__(self, config: WrappingConfig, box: Box, *, reverse: bool = True) -> None:
-        """Sets up a `Wrapping`.
-
-        Args:
-            config: Sizes.
-            box: What the triplane covers.
-            reverse: Whether the reverse projections c' are used (off: the ablation 'w/o {c'}').
-        """
+        """Covers a box; without `reverse`, the reverse projections c' are left out (the ablation 'w/o {c'}')."""
         super().__init__()
         self.config = config
         self.reverse = reverse

@@ -171,7 +171,7 @@ def fill_depth_folder(
     Args:
         root: The scene's folder.
         estimator: Gives disparity.
-        overwrite: Estimate anew what is already there.
+        overwrite: Estimate again what is already there.
         progress: Called with (photos done, photos in all).
 
     Returns:

@@ -1,4 +1,4 @@
-"""The rasteriser that callers see: checks what comes in and hands it to a backend."""
+"""The public functions of the rasteriser: they check their arguments and call a backend."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def pick_backend(device: torch.device | str) -> BackendName:
 
 def _module(name: BackendName):
     if name == "cpu":
-        from wildgs.rasterize.cpu import backend as module
+        from wildgs.rasterize import cpu as module
     elif name == "cuda":
         from wildgs.rasterize import cuda as module
     elif name == "reference":
@@ -29,11 +29,7 @@ def _module(name: BackendName):
 
 
 def _check(
-    name: str,
-    tensor: Tensor,
-    shape: tuple[int | None, ...],
-    like: Tensor,
-    backend: BackendName,
+    name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor, backend: BackendName
 ) -> None:
     """Shape (None: any size), device and number type of an input."""
     fits = tensor.dim() == len(shape) and all(
@@ -177,24 +173,10 @@ def rasterize(
     near: float = 0.01,
     depth: bool = True,
 ) -> Rendering:
-    """Renders Gaussians in one call: `project`, `sh_to_colors` where asked for, `blend`.
+    """Renders Gaussians in one call: `project`, `sh_to_colors` if `sh_degree` is given, `blend`.
 
-    Args:
-        means: See `project`.
-        quats: See `project`.
-        scales: See `project`.
-        opacities: See `project`.
-        colors: Values per Gaussian, or spherical harmonics if `sh_degree` is given.
-        camera: The camera.
-        sh_degree: Degree at which to evaluate the harmonics; None takes colours as they are.
-        background: Colour behind everything; black if None.
-        backend: See `project`.
-        near: See `project`.
-        depth: Whether to blend expected depth too.
-
-    Raises:
-        ValueError: Shapes, devices or number types do not fit.
-        UserError: The backend is not installed.
+    `colors` are values per Gaussian, or spherical harmonics to evaluate at `sh_degree`. The other arguments and the
+    errors are those of `project` and `blend`.
     """
     projection = project(means, quats, scales, opacities, camera, backend=backend, near=near)
     if sh_degree is not None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from wildgs.geometry.camera import Camera
+from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
 from wildgs.rasterize.interface import (
     DILATION,
@@ -24,17 +25,6 @@ from wildgs.rasterize.interface import (
 _ELEMENTS = 1 << 22  # (Gaussian, pixel) pairs held at once
 
 
-def quat_to_rotation(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Rotation matrices of quaternions (wxyz, any length but 0)."""
-    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return torch.stack(rows, dim=-2)
-
-
 def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int, height: int) -> Tensor:
     """Of the perspective projection, held constant beyond 0.15 picture widths outside the picture."""
     x, y, z = points.unbind(-1)
@@ -44,11 +34,7 @@ def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int,
     ty = (y / z).clamp(float(-cy / fy - margin_y), float((height - cy) / fy + margin_y))
     zero = torch.zeros_like(z)
     return torch.stack(
-        [
-            torch.stack([fx / z, zero, -fx * tx / z], -1),
-            torch.stack([zero, fy / z, -fy * ty / z], -1),
-        ],
-        dim=-2,
+        [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], dim=-2
     )
 
 
@@ -73,7 +59,7 @@ def project(
         points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         chosen = (_sound(means, quats, scales, opacities) & (points[:, 2] > near)).nonzero()[:, 0]
     points = means[chosen] @ viewmat[:3, :3].T + viewmat[:3, 3]
-    spread = viewmat[:3, :3] @ quat_to_rotation(quats[chosen]) * scales[chosen, None, :]
+    spread = viewmat[:3, :3] @ quats_to_rotations(quats[chosen]) * scales[chosen, None, :]
     footprint = _jacobian(points, K, camera.width, camera.height) @ spread
     covariance = footprint @ footprint.mT + DILATION * torch.eye(2).to(means)
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
@@ -105,10 +91,7 @@ def project(
 
 
 def blend(
-    projection: Projection,
-    colors: Float[Tensor, "N C"],
-    background: Float[Tensor, "C"] | None,
-    depth: bool,
+    projection: Projection, colors: Float[Tensor, "N C"], background: Float[Tensor, "C"] | None, depth: bool
 ) -> Rendering:
     """See `wildgs.rasterize.blend`."""
     camera = projection.camera

@@ -1,4 +1,4 @@
-"""Run folders: what training leaves and every other verb reads."""
+"""Run folders: what training writes and all other commands read."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
+from wildgs.progress import Counter
 from wildgs.runs.scenes import CHECKPOINT_FOLDER, adopt_scene, carried_record, require_same_scene
 from wildgs.scene import Alignment, Scene, load_scene
-from wildgs.scene.carried import SCENE_FILE, Progress, carry_scene, read_carried_scene
+from wildgs.scene.carried import SCENE_FILE, carry_scene, read_carried_scene
 from wildgs.scene.scene_record import SceneRecord
 
 CONFIG_FILE = "config.yaml"
@@ -72,7 +73,7 @@ class Run:
         root = self._scene_folder(None)
         return load_scene(root, self.config.data, alignment=self.alignment, lazy=True)
 
-    def read_scene(self, root: Path | None = None, progress: Progress | None = None) -> Scene:
+    def read_scene(self, root: Path | None = None, progress: Counter | None = None) -> Scene:
         """The scene with its full photos, masks, depth priors and truth, from its folder.
 
         Cameras, split, points and alignment are the run's own, so that a scene folder that changed since changes no
@@ -136,7 +137,7 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
 
 @contextmanager
 def _complete(folder: Path) -> Iterator[None]:
-    """Entries that a checkpoint lacks are a user's mistake: a file of another program, or another version."""
+    """Reports entries that a checkpoint lacks as a `UserError`: it is of another program, or another version."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
@@ -147,52 +148,64 @@ def _complete(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def lock_run(folder: Path) -> Iterator[None]:
-    """Keeps other trainings out of a run folder while the block runs; the lock dies with the process.
+def holding(lock_file: Path) -> Iterator[bool | None]:
+    """Tries to lock a file while the block runs; the lock ends with the process.
+
+    Yields:
+        Whether this process holds the lock; None on a disk without locks, as some network disks are.
 
     Raises:
-        UserError: Another process trains into it, or it cannot be written to.
+        UserError: The folder cannot be written to.
     """
+    lock = filelock.FileLock(lock_file, timeout=0)
+    held: bool | None = True
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder / LOCK_FILE, timeout=0)
+        lock_file.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
-    except filelock.Timeout as error:
-        raise UserError(
-            f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
-        ) from error
-    except NotImplementedError:  # so filelock calls a disk that has no locks, as some network disks
-        warnings.warn(
-            f"{folder} lies on a disk without locks: nothing keeps a second training out of it",
-            WildGSWarning,
-            stacklevel=3,
-        )
-        yield
-        return
+    except filelock.Timeout:
+        held = False
+    except NotImplementedError:
+        held = None
     except OSError as error:
-        raise UserError(f"{folder} cannot be written to ({error}); choose another --output") from error
+        raise UserError(
+            f"{lock_file.parent} cannot be written to ({error}); choose another --output"
+        ) from error
     try:
-        yield
+        yield held
     finally:
         lock.release()
 
 
+@contextmanager
+def lock_run(folder: Path) -> Iterator[None]:
+    """Keeps other trainings out of a run folder while the block runs.
+
+    Raises:
+        UserError: Another process uses the folder, or it cannot be written to.
+    """
+    with holding(folder / LOCK_FILE) as held:
+        if held is None:
+            message = f"{folder} is on a disk without locks: nothing keeps a second training out of it"
+            warnings.warn(message, WildGSWarning, stacklevel=3)
+        elif not held:
+            raise UserError(
+                f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
+            )
+        yield
+
+
 def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
-    """The newest checkpoint of a run folder that is whole, or None; see `load_newest`."""
+    """The newest undamaged checkpoint of a run folder, or None; see `load_newest`."""
     return load_newest(folder / CHECKPOINT_FOLDER, set_aside=set_aside)
 
 
 def refuse_trained(folder: Path) -> None:
-    """Protects a run from being trained over.
-
-    Raises:
-        UserError: The folder already holds one, or its checkpoints have no place.
-    """
+    """Raises `UserError` if a folder holds a run already, or no checkpoints can be written to it."""
     checkpoints = folder / CHECKPOINT_FOLDER
     if checkpoints.exists() and not checkpoints.is_dir():
         raise UserError(f"{checkpoints} is not a folder: move it away, or choose another --output")
     if list_checkpoints(checkpoints):
-        raise UserError(f"{folder} already holds a run; add --resume to go on, or choose another --output")
+        raise UserError(f"{folder} already holds a run; add --resume to continue, or choose another --output")
 
 
 def prepare_training(
@@ -202,19 +215,19 @@ def prepare_training(
     *,
     resume: bool,
     team: Team | None = None,
-    progress: Progress | None = None,
+    progress: Counter | None = None,
 ) -> Trainer:
-    """A trainer at step 0, or at the newest whole checkpoint of a run that may have a lower budget now.
+    """A trainer at step 0, or at the newest undamaged checkpoint of a run, with a budget that may be lower.
 
     Of several processes, rank 0 alone reads and writes the run folder.
 
     Args:
         folder: The run folder.
         config: Of the run.
-        scene: What is trained on.
-        resume: Whether to go on with a run.
-        team: The processes that train together.
-        progress: Called with (photos, photos in all) while the run folder gets its copies of the photos.
+        scene: The scene to train on.
+        resume: Whether to resume a run.
+        team: The processes that train the run.
+        progress: Called with (photos, photos in all) while photos are copied to the run folder.
 
     Raises:
         UserError: As `start_training` and `resume_training` do.
@@ -228,7 +241,7 @@ def prepare_training(
         team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
     trainer = resume_training(folder, scene, team=team, progress=progress)
     if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
-        # Saved at once, so that a run killed from here on goes on from this very state.
+        # Saved at once, so that a run that is killed now resumes from this state.
         team.from_first(lambda: save_run(folder, trainer, config, scene.alignment))
     return trainer
 
@@ -239,7 +252,7 @@ def start_training(
     scene: Scene,
     device: torch.device | None = None,
     team: Team | None = None,
-    progress: Progress | None = None,
+    progress: Counter | None = None,
 ) -> Trainer:
     """A trainer at step 0; writes the run's configuration and what the run carries of its scene.
 
@@ -250,7 +263,7 @@ def start_training(
     team.from_first(lambda: _claim(folder, config, scene, progress))
     device = device or default_device()
     # The trainer keeps the generators' states; the process gets its own back.
-    with team.together(), torch.random.fork_rng([device] if device.type == "cuda" else []):
+    with team.propagate_errors(), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.train.seed)
         budget = config.train.density.max_gaussians
         method = create_method(
@@ -259,7 +272,7 @@ def start_training(
         return Trainer(method.to(device), scene, config.train, team)
 
 
-def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Progress | None) -> None:
+def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Counter | None) -> None:
     refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
@@ -271,7 +284,7 @@ def resume_training(
     scene: Scene,
     device: torch.device | None = None,
     team: Team | None = None,
-    progress: Progress | None = None,
+    progress: Counter | None = None,
 ) -> Trainer:
     """A trainer at the newest undamaged checkpoint, with the configuration that the run began with.
 
@@ -288,7 +301,7 @@ def resume_training(
         return start_training(folder, config, scene, device, team, progress)
     team.from_first(lambda: _refuse_edited(folder, config, checkpoint))
     record = team.from_first(lambda: carried_record(folder, scene, progress))
-    with team.together(), _complete(folder):
+    with team.propagate_errors(), _complete(folder):
         method = restore_method(config.method, config.model, checkpoint.method)
         scene = adopt_scene(record, scene, folder)
         trainer = Trainer(method.to(device or default_device()), scene, config.train, team)
@@ -305,11 +318,7 @@ def _refuse_edited(folder: Path, config: RunConfig, checkpoint: Checkpoint) -> N
 
 
 def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Alignment) -> Path:
-    """Writes a checkpoint from which training can go on and every other verb can read.
-
-    Raises:
-        UserError: It cannot be written.
-    """
+    """Writes a checkpoint of a run; raises `UserError` if it cannot be written."""
     return save_checkpoint(folder / CHECKPOINT_FOLDER, *run_state(trainer, config, alignment))
 
 

@@ -1,4 +1,4 @@
-"""A run and the scene folder that it is used with: is it the same scene, and what has changed?"""
+"""Compares the scene that a run carries with the scene folder that it is used with."""
 
 from __future__ import annotations
 
@@ -7,23 +7,16 @@ from pathlib import Path
 
 from wildgs.engine.checkpoint import list_checkpoints, load_header
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.progress import Counter
 from wildgs.scene import Alignment, Scene
-from wildgs.scene.carried import SCENE_FILE, Progress, carry_scene
+from wildgs.scene.carried import SCENE_FILE, carry_scene
 from wildgs.scene.scene_record import SceneRecord
 
 CHECKPOINT_FOLDER = "checkpoints"
 
 
 def require_same_scene(folder: Path, scene: Scene) -> None:
-    """Refuses to train a scene into a run of another one.
-
-    Args:
-        folder: The run folder.
-        scene: What is to be trained on.
-
-    Raises:
-        UserError: The run was trained on another scene.
-    """
+    """Raises `UserError` if the run in a folder was trained on another scene."""
     if (folder / SCENE_FILE).is_file():
         same = SceneRecord.read(folder / SCENE_FILE).is_of(scene)
     else:  # a run of an earlier version
@@ -61,7 +54,7 @@ def adopt_scene(record: SceneRecord, found: Scene, folder: Path) -> Scene:
     return scene
 
 
-def carried_record(folder: Path, scene: Scene, progress: Progress | None) -> SceneRecord:
+def carried_record(folder: Path, scene: Scene, progress: Counter | None) -> SceneRecord:
     """What the run carries of its scene; written first where an earlier version began the run."""
     require_same_scene(folder, scene)
     if not (folder / SCENE_FILE).is_file():

@@ -7,8 +7,7 @@ smaller where it is large, and its mask: what the photo's appearance is read fro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from PIL import Image
 
 from wildgs.errors import UserError
 from wildgs.files import written_aside
+from wildgs.progress import Counter, in_threads
 from wildgs.scene.image_cache import DECODERS, ImageCache
 from wildgs.scene.images import Photo, UnreadableImageError, read_mask, read_photo
 from wildgs.scene.photo_store import PhotoStore
@@ -36,10 +36,8 @@ MAX_PIXELS = 160_000_000
 QUALITY = 95
 """Of the JPEG files, without chroma subsampling."""
 
-Progress = Callable[[int, int], None]
 
-
-def carry_scene(folder: Path, scene: Scene, progress: Progress | None = None) -> None:
+def carry_scene(folder: Path, scene: Scene, progress: Counter | None = None) -> None:
     """Writes what a run needs of its scene into the run folder.
 
     `scene.safetensors` comes last: where it is, all is there.
@@ -59,26 +57,17 @@ def carry_scene(folder: Path, scene: Scene, progress: Progress | None = None) ->
         number, view = numbered
         try:
             photo = view.photos.get(view.name)
-        except UserError:  # gone since it was first read; training goes on without it, too
+        except UserError:  # gone since it was first read; training continues without it, too
             return
         _write_photo(lights, number, photo, side)
 
-    pool = ThreadPoolExecutor(DECODERS)
-    try:
-        for count, _ in enumerate(pool.map(write, enumerate(scene.views)), start=1):
-            if progress is not None:
-                progress(count, len(scene.views))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    for _ in in_threads(write, list(enumerate(scene.views)), DECODERS, progress):
+        pass
     SceneRecord.of(scene).write(folder / SCENE_FILE)
 
 
 def carried_side(sizes: Sequence[tuple[int, int]]) -> int:
-    """The long side, in pixels, at which photos of these sizes are carried.
-
-    Args:
-        sizes: Width and height of every photo.
-    """
+    """The long side, in pixels, at which photos of these widths and heights are carried."""
     pixels_per_side = sum(min(size) / max(size) for size in sizes)
     within_total = math.isqrt(int(MAX_PIXELS / max(pixels_per_side, 1e-9)))
     return max(MIN_SIDE, min(MAX_SIDE, within_total))
@@ -108,10 +97,7 @@ def _mask_file(lights: Path, number: int) -> Path:
 
 
 def read_carried_scene(folder: Path) -> Scene | None:
-    """The scene that a run folder carries; its photos are decoded when they are asked for.
-
-    Returns:
-        The scene, with the run folder as its root; None for runs that carry none (of earlier versions).
+    """The scene that a run folder carries; its photos are decoded on demand. None for runs of earlier versions.
 
     Raises:
         UserError: The file cannot be read.
@@ -137,12 +123,7 @@ class CarriedPhotos(PhotoStore):
     """The photos in a run's `lights/`, at the size of their cameras (larger ones are interpolated)."""
 
     def __init__(self, folder: Path, record: SceneRecord) -> None:
-        """Sets up `CarriedPhotos`.
-
-        Args:
-            folder: `lights/`.
-            record: The scene whose photos they are.
-        """
+        """Reads from a folder `lights/` the photos of a recorded scene."""
         self._folder = folder
         self._numbers = {name: number for number, name in enumerate(record.names)}
         self._sizes = [(int(width), int(height)) for width, height in record.sizes]

@@ -109,7 +109,7 @@ def read_model(root: Path) -> ColmapModel:
     try:
         records = read_binary(folder) if binary else read_text(folder)
     except (ModelFileError, OSError, MemoryError) as error:
-        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); make it anew") from error
+        raise UserError(f"{folder}: the COLMAP model cannot be read ({error}); rebuild it") from error
     registered = _usable(records, folder)
     with np.errstate(invalid="ignore"):
         finite = np.all(np.abs(records.points.xyz) < MAX_COORDINATE, axis=1)
@@ -153,12 +153,12 @@ def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
             f"{folder}: the COLMAP model holds no photo with a pose; run `wildgs sfm` on the photos"
         )
     if len({image.image_id for image in images}) != len(images):
-        raise UserError(f"{folder}: two photos of the COLMAP model have one id; make it anew")
+        raise UserError(f"{folder}: two photos of the COLMAP model have one id; rebuild it")
     faults = {image.name: fault for image in images if (fault := _fault(image, records.cameras))}
     good = [image for image in images if image.name not in faults]
     described = describe_names([f"{name!r} ({fault})" for name, fault in faults.items()])
     if not good:
-        raise UserError(f"{folder}: no photo of the COLMAP model can be used: {described}; make it anew")
+        raise UserError(f"{folder}: no photo of the COLMAP model can be used: {described}; rebuild it")
     if faults:
         warnings.warn(
             f"{folder}: {len(faults)} photos cannot be used and are left out: {described}",
@@ -178,14 +178,14 @@ def _fault(image: ImageRecord, cameras: dict[int, Any]) -> str | None:
         return "its camera's parameters make no sense"
     pose = np.array([*image.quat, *image.translation])
     if not np.isfinite(pose).all() or np.abs(pose).max() > MAX_COORDINATE:
-        return "its pose is no finite number"
+        return "its pose is not finite"
     return None if np.linalg.norm(image.quat) > 1e-12 else "its rotation is zero"
 
 
 def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
     repeated = sorted({a for a, b in itertools.pairwise(names) if a == b})
     if repeated:
-        raise UserError(f"{folder}: the photo {repeated[0]!r} is in the COLMAP model twice; make it anew")
+        raise UserError(f"{folder}: the photo {repeated[0]!r} is in the COLMAP model twice; rebuild it")
 
 
 def _checked_name(name: str, folder: Path) -> str:

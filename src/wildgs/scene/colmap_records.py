@@ -1,6 +1,6 @@
-"""COLMAP's model as records, and what both of its formats share: nothing in a file is believed.
+"""Records of a COLMAP model, and what its two formats share: nothing in a file is trusted.
 
-COLMAP's own reader is C++ and takes the counts that a file declares for true: a damaged or hostile file can end the
+COLMAP's own reader is C++ and trusts the counts that a file declares: a damaged or malicious file can crash the
 process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". Observations (points2D) are passed
 over, because nothing here needs them.
 """
@@ -21,7 +21,7 @@ MAX_CAMERA_SIDE = 10**6
 
 
 class ModelFileError(Exception):
-    """A model file that is none; the message says where and why."""
+    """An invalid model file; the message says where and why."""
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,7 @@ ARCHIVE = Path(__file__).with_name("demo.zip")
 
 
 def write_demo_scene(folder: Path) -> Path:
-    """Unpacks the demo's scene: photos, COLMAP model, split, depth priors and the truth for scoring.
-
-    A folder that holds the scene already is left as it is; one that is there holds all of it.
-
-    Args:
-        folder: The scene folder to make.
-
-    Returns:
-        The folder.
-    """
+    """Unpacks the demo's scene (photos, model, split, depth priors, truth) unless the folder exists."""
     if not folder.exists():
         partial = folder.with_name(folder.name + ".partial")
         with zipfile.ZipFile(ARCHIVE) as archive:

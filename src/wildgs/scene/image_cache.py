@@ -30,7 +30,7 @@ class ImageCache:
     """Keeps decoded photos; safe to use from several threads.
 
     Attributes:
-        limit: Bytes; a few photos around the present one are kept even where they exceed it.
+        limit: Bytes; the last few photos are kept even if they exceed it.
         decoded: How many photos were decoded again so far.
     """
 
@@ -52,13 +52,7 @@ class ImageCache:
         return self._kept_bytes + self._recent_bytes
 
     def put(self, name: str, photo: Photo, *, keep: bool = True) -> None:
-        """Takes a photo in.
-
-        Args:
-            name: Of the photo.
-            photo: Decoded.
-            keep: Whether it may stay for good, as photos that train do.
-        """
+        """Adds a decoded photo; with `keep` it may stay, as photos that train do."""
         size = photo.num_bytes
         with self._lock:
             if name in self._kept or name in self._recent:
@@ -75,16 +69,7 @@ class ImageCache:
                 self._recent_bytes -= old.num_bytes
 
     def get(self, name: str, load: Callable[[], Photo]) -> Photo:
-        """A photo, from the cache, from a background thread that is at it, or decoded now.
-
-        Args:
-            name: Of the photo.
-            load: Decodes its files.
-
-        Raises:
-            UnreadableImageError: It cannot be decoded.
-            UserError: Likewise.
-        """
+        """A photo from the cache or from the background thread that decodes it, or else decoded now by `load`."""
         with self._lock:
             if name in self._kept:
                 return self._kept[name]

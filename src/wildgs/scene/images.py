@@ -1,4 +1,4 @@
-"""Pictures from disk as 8-bit arrays: any mode, any orientation, any broken file named.
+"""Pictures from disk as 8-bit arrays, of any mode and orientation; broken files raise an error that says why.
 
 Colours stay in the photo's own encoding (sRGB as a rule), as every photo collection of the field uses them.
 """
@@ -36,7 +36,7 @@ FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000"
 """What is decoded, whatever a file's name says. Others that Pillow knows start programs (EPS runs Ghostscript)."""
 
 DECODING_PIXELS = 100_000_000
-"""Pixels that all threads together decode at the same time; a larger picture waits until it is alone."""
+"""Pixels that all threads decode at the same time; a larger picture waits for the others."""
 
 _open_lock = threading.Lock()
 
@@ -46,7 +46,7 @@ class UnreadableImageError(Exception):
 
 
 class ShapeMismatchError(UnreadableImageError):
-    """A picture whose shape is not its camera's: the scene is put together wrongly, the file is sound."""
+    """A picture whose shape is not its camera's: the file is valid, the scene is inconsistent."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,9 @@ _budget = _DecodingBudget()
 
 
 def decoding(image: Image.Image) -> AbstractContextManager[None]:
-    """Waits until the picture may be decoded; memory for its pixels is bounded over all threads in the block.
+    """Waits until the picture may be decoded: memory for pixels is bounded over all threads in such blocks.
 
-    Every function of this module that decodes does so by itself. A caller that keeps several copies of the pixels
-    holds its share for as long.
+    The functions of this module do this themselves; callers that hold several copies of the pixels do it, too.
     """
     return _budget.share(image.width * image.height)
 
@@ -176,7 +175,7 @@ def _orientation(image: Image.Image) -> int:
 def _upright(image: Image.Image) -> Image.Image:
     """The loaded picture with its EXIF orientation applied.
 
-    `ImageOps.exif_transpose` also writes the EXIF block anew, which fails on blocks with odd entries.
+    `ImageOps.exif_transpose` also rewrites the EXIF block, which fails on blocks with odd entries.
     """
     method = TRANSPOSITIONS.get(_orientation(image))
     return image if method is None else image.transpose(method)

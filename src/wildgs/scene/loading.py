@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import torch
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
+from wildgs.progress import Counter, in_threads
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
@@ -33,7 +33,7 @@ def load_scene(
     alignment: Alignment | None = None,
     lazy: bool = False,
     image_cache: str = IMAGE_CACHE,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counter | None = None,
 ) -> Scene:
     """Read a COLMAP scene: cameras, points, split, photos (8 bits, within `image_cache`), masks, depth.
 
@@ -127,7 +127,7 @@ def _load_views(
     alignment: Alignment,
     config: DataConfig,
     lazy: bool,
-    progress: Callable[[int, int], None] | None,
+    progress: Counter | None,
 ) -> tuple[list[View], list[tuple[str, str]]]:
     """Views in the order of their names, and (name, reason) of the photos that cannot be read."""
     views: list[View] = []
@@ -145,17 +145,11 @@ def _load_views(
         camera = replace(camera, viewmat=camera.viewmat.float(), K=camera.K.float())
         return View(image.name, camera, splits[image.name], photos)
 
-    pool = ThreadPoolExecutor(DECODERS)
-    try:
-        for count, (image, view) in enumerate(zip(chosen, pool.map(load, chosen), strict=True), start=1):
-            if isinstance(view, str):
-                broken.append((image.name, view))
-            else:
-                views.append(view)
-            if progress is not None:
-                progress(count, len(chosen))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    for image, view in zip(chosen, in_threads(load, chosen, DECODERS, progress), strict=True):
+        if isinstance(view, str):
+            broken.append((image.name, view))
+        else:
+            views.append(view)
     return views, broken
 
 

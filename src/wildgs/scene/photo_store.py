@@ -1,4 +1,4 @@
-"""One store of photos: a view's pixels, mask and depth prior, decoded when they are needed."""
+"""Stores of photos: a view's pixels, mask and depth prior, decoded when they are needed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -33,23 +32,18 @@ def with_ending(name: str, ending: str) -> str:
 
 
 def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
-    """Where a scene keeps the disparity of its photos.
+    """The files of the disparity of a scene's photos, by the names of all photos of its model.
 
     `depth/<stem>.png`, sub-folders kept; photos that differ by their ending alone (`a.jpg` and `a.png`) have
     `depth/<name>.png`, so that no two share a file.
-
-    Args:
-        root: The scene's folder.
-        names: All photos of its model.
     """
     names = list(names)
     shared = _shared_stems(names)
-    return {
-        name: root
-        / "depth"
-        / (f"{name}.png" if with_ending(name, "") in shared else with_ending(name, ".png"))
+    files = {
+        name: f"{name}.png" if with_ending(name, "") in shared else with_ending(name, ".png")
         for name in names
     }
+    return {name: root / "depth" / file for name, file in files.items()}
 
 
 def _shared_stems(names: Iterable[str]) -> set[str]:
@@ -80,7 +74,7 @@ class PhotoStore(ABC):
         return {}
 
     def prefetch(self, name: str) -> None:  # noqa: B027 - stores that need no preparation do nothing
-        """Says that a photo's turn comes soon, so that it can be decoded in the background."""
+        """Announces that a photo is needed soon, so that it can be decoded in the background."""
 
     def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
         """The photo without its transients (only evaluation may look at it); None where there is none.
@@ -97,33 +91,6 @@ class PhotoStore(ABC):
             UserError: The file is there and cannot be used.
         """
         return None
-
-
-@dataclass
-class MemoryPhotos(PhotoStore):
-    """Photos that are in memory already.
-
-    Attributes:
-        photos: By name.
-        clean: Photos without their transients, by name.
-        truth_masks: True masks, by name.
-    """
-
-    photos: dict[str, Photo] = field(default_factory=dict)
-    clean: dict[str, UInt8[np.ndarray, "_ _ 3"]] = field(default_factory=dict)
-    truth_masks: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
-
-    def get(self, name: str) -> Photo:
-        """See `PhotoStore.get`."""
-        return self.photos[name]
-
-    def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-        """See `PhotoStore.read_clean`."""
-        return self.clean.get(name)
-
-    def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
-        """See `PhotoStore.read_truth_mask`."""
-        return self.truth_masks.get(name)
 
 
 class ScenePhotos(PhotoStore):
@@ -144,17 +111,7 @@ class ScenePhotos(PhotoStore):
         use_depth: bool = True,
         max_pixels: int = MAX_IMAGE_PIXELS,
     ) -> None:
-        """Sets up `ScenePhotos` without photos; `add` makes them known.
-
-        Args:
-            root: The scene's folder.
-            images_dir: The folder of its photos.
-            names: All photos of its model; they tell which files a mask or depth prior belongs to.
-            cache: Keeps decoded photos.
-            use_masks: Whether the user's masks are read.
-            use_depth: Whether depth priors are read.
-            max_pixels: Larger pictures are refused.
-        """
+        """Starts without photos, which `add` registers; `names` are all photos of the model."""
         self.root = root
         self.images_dir = images_dir
         self.cache = cache
@@ -168,20 +125,11 @@ class ScenePhotos(PhotoStore):
         self.blank: set[str] = set()
 
     def add(self, name: str, grid: PixelGrid) -> None:
-        """Makes a photo known.
-
-        Args:
-            name: Its path within the folder of photos.
-            grid: From the stored photo's pixels to the view's.
-        """
+        """Registers a photo, by its path within the folder of photos."""
         self._grids[name] = grid
 
     def load(self, name: str, *, keep: bool) -> None:
-        """Decodes a photo for the first time.
-
-        Args:
-            name: Of the photo.
-            keep: Whether it may stay in memory for good, as photos that train do.
+        """Decodes a photo for the first time; with `keep` it may stay in memory, as photos that train do.
 
         Raises:
             UnreadableImageError: The photo itself cannot be decoded.
@@ -294,7 +242,7 @@ class ScenePhotos(PhotoStore):
         return Photo(pixels, None if mask is None or mask.all() else mask, self._read_disparity(name, grid))
 
     def _read_disparity(self, name: str, grid: PixelGrid) -> UInt16[np.ndarray, "H W"] | None:
-        """The depth prior; one that is missing or broken is not looked for, and warned of, again."""
+        """The depth prior; a missing or broken file is looked for, and warned of, once."""
         path = self._depth[name]
         if not self.use_depth or name in self._without_depth or not is_there(path):
             self._without_depth.add(name)

@@ -130,14 +130,7 @@ class View:
         self.photos.prefetch(self.name)
 
     def load(self, device: torch.device) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
-        """The photo as methods take it.
-
-        Args:
-            device: Where the tensors go.
-
-        Returns:
-            RGB in [0, 1], and which pixels count (False = ignore; None = all).
-        """
+        """The photo as methods take it: RGB in [0, 1], and which pixels count (False = ignore; None = all)."""
         mask = self.read_mask()
         keep = None if mask is None else upload(mask, device) > 0
         return to_unit(self.read_photo(), device), keep

@@ -1,4 +1,4 @@
-"""A scene without its photos, as numbers: written with a run, and compared with the scene that is found later."""
+"""A scene without its photos: written with a run, and compared with the scene that it is used with later."""
 
 from __future__ import annotations
 
@@ -119,11 +119,7 @@ class SceneRecord:
         return record
 
     def _check(self) -> None:
-        """Refuses rows that do not fit together.
-
-        Raises:
-            ValueError: They do not.
-        """
+        """Raises `ValueError` if tensors do not fit each other."""
         views, points = len(self.names), len(self.points)
         if len(self.contents) not in (0, views):
             raise ValueError("its fingerprints are not one for each photo")
@@ -163,15 +159,9 @@ class SceneRecord:
         return Scene(root, views, self.points, self.point_colors, self.alignment, self.observations)
 
     def adopt(self, found: Scene) -> tuple[Scene, list[str]]:
-        """The recorded scene with the photos of one that was read from a folder.
+        """The recorded scene with the photos of the scene as it is now, and what differs between the two, in words.
 
         Poses, split, points and alignment are the record's; intrinsics are those of the photos found.
-
-        Args:
-            found: The scene as it is now.
-
-        Returns:
-            The scene, and what differs between the two, in words; empty where nothing does.
         """
         now = {view.name: view for view in found.views}
         recorded = self.scene(found.root, found.views[0].photos)

@@ -1,15 +1,14 @@
-"""What a new photo is localised against: SIFT descriptors of a scene's triangulated points.
+"""An index of SIFT descriptors of a scene's triangulated points, in which new photos are localised.
 
-Features are found anew in the scene's photos, and one that lies where a photo observes a point stands for that
-point. Cameras, points, their observations and the photos are all that is needed: a run carries them
-(`wildgs.scene.carried`), and no database of the reconstruction has to be kept.
+Features are detected in the scene's photos, and those at the observation of a point describe the point. This needs
+only what a run carries (`wildgs.scene.carried`): cameras, points, observations and photos, and no database of the
+reconstruction.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.files import check_regular, written_aside
+from wildgs.progress import Counter
 from wildgs.scene import Scene, View
 from wildgs.sfm.mapping import quiet
 
@@ -35,14 +35,12 @@ MAX_IMAGE_SIZE = 1600
 """Features are sought at no more than this many pixels on the long side."""
 
 SAME_PLACE = 0.0025
-"""A feature and an observation are one within this share of the photo's long side (2 pixels of 800)."""
-
-Progress = Callable[[int, int], None]
+"""Largest distance of a feature from an observation of the same point, as a share of the photo's long side."""
 
 
 @dataclass(frozen=True)
 class FeatureIndex:
-    """Triangulated points by what they look like.
+    """Triangulated points with their descriptors.
 
     Attributes:
         descriptors: SIFT, as COLMAP stores it (root of L1-normalised, norm about 512).
@@ -56,7 +54,7 @@ class FeatureIndex:
 
 
 def load_feature_index(
-    scene: Scene, cache: Path | None = None, progress: Progress | None = None
+    scene: Scene, cache: Path | None = None, progress: Counter | None = None
 ) -> FeatureIndex:
     """The feature index of a scene, from the cache where that is of this scene.
 
@@ -97,7 +95,7 @@ def _read_cache(file: Path, state: str) -> FeatureIndex | None:
         return None
 
 
-def _index_features(scene: Scene, progress: Progress | None) -> FeatureIndex:
+def _index_features(scene: Scene, progress: Counter | None) -> FeatureIndex:
     counts = torch.bincount(scene.observations[:, 0].long(), minlength=len(scene.views))
     chosen = counts.argsort(descending=True, stable=True)[:MAX_PHOTOS]
     chosen = chosen[counts[chosen] > 0].sort().values.tolist()
@@ -148,14 +146,9 @@ def _described_points(
 def find_features(
     pixels: UInt8[np.ndarray, "H W 3"], limit: int = MAX_IMAGE_SIZE
 ) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
-    """SIFT features of a photo.
+    """SIFT features of an RGB photo: positions in its pixels, and descriptors.
 
-    Args:
-        pixels: RGB.
-        limit: Features are sought at no more than this many pixels on the long side.
-
-    Returns:
-        Positions in the photo's pixels, and descriptors.
+    They are sought at no more than `limit` pixels on the long side.
     """
     height, width = pixels.shape[:2]
     grey = Image.fromarray(pixels).convert("L")
@@ -168,19 +161,19 @@ def find_features(
 
 
 def match_features(
-    features: UInt8[np.ndarray, "F 128"], landmarks: FeatureIndex, ratio: float
+    features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, ratio: float
 ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
     """Features that look like one point and like no other (Lowe's ratio test, over points instead of features).
 
     Args:
         features: Descriptors of a new photo.
-        landmarks: What is sought.
+        index: The points that are sought.
         ratio: Largest distance to the best point, relative to the best of all other points.
 
     Returns:
         Rows of features and of points; every point once, with the feature most like it.
     """
-    likeness, owners = _nearest(features, landmarks)
+    likeness, owners = _nearest(features, index)
     distance = np.arccos(np.clip(likeness, -1, 1))
     rivals = np.where(owners == owners[:, :1], np.inf, distance).min(axis=1)
     good = np.flatnonzero(distance[:, 0] < ratio * np.minimum(rivals, np.pi / 2))
@@ -191,14 +184,14 @@ def match_features(
 
 
 def _nearest(
-    features: UInt8[np.ndarray, "F 128"], landmarks: FeatureIndex, count: int = 8, block: int = 65_536
+    features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, count: int = 8, block: int = 65_536
 ) -> tuple[Shaped[np.ndarray, "F k"], Int64[np.ndarray, "F k"]]:
     """Cosine and owner of the descriptors most alike, the best first, without the whole table in memory."""
     queries = torch.nn.functional.normalize(torch.from_numpy(features).float(), dim=1)
-    owners = torch.from_numpy(landmarks.owners)
+    owners = torch.from_numpy(index.owners)
     likeness, best = torch.zeros(len(queries), 0), torch.zeros(len(queries), 0, dtype=torch.int64)
     for start in range(0, len(owners), block):
-        rows = torch.from_numpy(landmarks.descriptors[start : start + block]).float()
+        rows = torch.from_numpy(index.descriptors[start : start + block]).float()
         cosines = queries @ torch.nn.functional.normalize(rows, dim=1).T
         found = cosines.topk(min(count, len(rows)), dim=1)
         likeness = torch.cat([likeness, found.values], dim=1)

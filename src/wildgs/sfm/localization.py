@@ -1,4 +1,4 @@
-"""Where was this photo taken? The camera of a new photo of a scene, from the scene's own SfM model.
+"""Localisation: the camera of a new photo in the scene's SfM model.
 
 SIFT features are matched to the model's points, and the pose comes from RANSAC and refinement by pycolmap. The
 focal length is that of the EXIF block, or estimated with the pose.
@@ -27,7 +27,7 @@ from wildgs.sfm.mapping import quiet
 from wildgs.sfm.upright import save_jpeg
 
 MIN_INLIERS = 15
-"""Fewer points that agree with a pose may do so by chance: photos of other places reach 5."""
+"""Least inliers of a pose; photos of other places reach 5."""
 
 MATCH_RATIO = 0.85
 MAX_ERROR = 0.008
@@ -47,7 +47,7 @@ MAX_DISTORTION = 0.2
 
 
 class LocalizationError(UserError):
-    """The photo could not be placed in the scene; the message says how far it got."""
+    """The photo could not be localised; the message gives inliers and matches."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class LocalizedPhoto:
     Attributes:
         photo: Undistorted, at the size at which the scene's photos are used.
         camera: Its pinhole camera in the scene's aligned frame.
-        inliers: Points of the model that the pose explains.
-        matches: Points that the photo seemed to show.
+        inliers: Matches that agree with the pose.
+        matches: Points that match features of the photo.
         focal: Focal length, relative to the long side.
         focal_from_exif: Whether the search began at the EXIF block's focal length.
     """
@@ -79,12 +79,12 @@ class LocalizedPhoto:
         )
 
 
-def localize(file: Path, landmarks: FeatureIndex, long_side: int, *, seed: int = 0) -> LocalizedPhoto:
-    """Finds the camera of a photo of the place.
+def localize(file: Path, index: FeatureIndex, long_side: int, *, seed: int = 0) -> LocalizedPhoto:
+    """Finds the camera of a photo of the scene.
 
     Args:
         file: The photo; any size, upright or with an EXIF orientation.
-        landmarks: Of the scene.
+        index: Feature index of the scene.
         long_side: Pixels to which the photo is shrunk for use.
         seed: Of RANSAC.
 
@@ -100,8 +100,8 @@ def localize(file: Path, landmarks: FeatureIndex, long_side: int, *, seed: int =
     features, descriptors = find_features(pixels)
     matched, seen = (np.zeros(0, np.int64),) * 2
     if len(features):
-        matched, seen = match_features(descriptors, landmarks, MATCH_RATIO)
-    answer = _solve(features[matched], landmarks.points[seen], camera, known, seed)
+        matched, seen = match_features(descriptors, index, MATCH_RATIO)
+    answer = _solve(features[matched], index.points[seen], camera, known, seed)
     inliers = 0 if answer is None else int(answer["num_inliers"])
     if answer is None or inliers < MIN_INLIERS:
         raise LocalizationError(
@@ -115,7 +115,7 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
     """A camera with the EXIF block's focal length where it has one, and whether it has.
 
     COLMAP (in C++, in the trainer's own process where a viewer asks) sees no byte of the file: only the entries
-    that Pillow could read, written anew beside a small empty picture of the same shape.
+    that Pillow could read, rewritten beside a small empty picture of the same shape.
     """
     try:
         with tempfile.TemporaryDirectory() as folder, open_image(file) as image, quiet():
@@ -188,7 +188,7 @@ def _as_view(
     matches: int,
     known: bool,
 ) -> LocalizedPhoto:
-    """The photo as the scene's own are: pinhole, aligned, of their size."""
+    """The photo as a view of the scene: pinhole camera, aligned frame, size of the scene's photos."""
     longest = max(camera.width, camera.height)
     grid = PixelGrid.from_colmap(camera, max_side=long_side)
     image = Image.fromarray(pixels).resize(grid.resized, Image.Resampling.LANCZOS)

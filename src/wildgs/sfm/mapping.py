@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +13,11 @@ import numpy as np
 import pycolmap
 
 from wildgs.errors import UserError
+from wildgs.progress import Progress
 from wildgs.scene.images import DECODING_PIXELS, open_image
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.pairs import Pairing, choose_pairs
 from wildgs.sfm.upright import WorkingCopy
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and of how much (0 = not known)."""
 
 EXTRACTION_BATCH = 16
 MATCHING_BLOCK = 50
@@ -28,7 +26,7 @@ MATCHING_BLOCK = 50
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders and files beside the output while the work goes on."""
+    """Temporary folders and files beside the output."""
 
     root: Path
 
@@ -55,7 +53,7 @@ class Workplace:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """COLMAP logs every step to stderr; failures reach us as exceptions and empty results."""
+    """Silences COLMAP's log on stderr; errors are exceptions and empty results."""
     previous = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:

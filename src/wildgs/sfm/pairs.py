@@ -1,9 +1,8 @@
-"""Which photos to match with which: all with all for small sets, near neighbours for large ones.
+"""Pairs of photos to match: all of them for small sets, near neighbours for large ones.
 
-The cost of matching must not grow with the square of the number of photos. Neighbours come from the photos'
-GPS positions where enough of them carry one, else from retrieval by VLAD descriptors (Jegou et al.,
-"Aggregating local descriptors into a compact image representation", CVPR 2010) of the SIFT features that are
-there anyway, so that no vocabulary needs to be downloaded.
+Neighbours come from GPS positions if enough photos have one, else from retrieval by VLAD descriptors (Jegou et al.,
+"Aggregating local descriptors into a compact image representation", CVPR 2010) of the SIFT features, for which no
+vocabulary has to be downloaded.
 """
 
 from __future__ import annotations
@@ -45,12 +44,7 @@ def exhaustive_pairs(count: int) -> Pairing:
 
 
 def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set[tuple[int, int]]:
-    """Photos with those that look most like them.
-
-    Args:
-        vlads: A unit vector for every photo.
-        partners: From the photos that look for partners to how many they look for.
-    """
+    """Photos with the most similar ones, by their unit vectors; `partners` is how many to find by photo."""
     pairs = set()
     for photo, wanted in partners.items():
         likeness = vlads @ vlads[photo]
@@ -111,7 +105,7 @@ def _vlad(features: Float[Tensor, "F 128"], words: Float[Tensor, "K 128"]) -> Fl
 def near_pairs(
     positions: Mapping[int, tuple[float, float]], neighbours: int, max_distance: float
 ) -> set[tuple[int, int]]:
-    """Photos with those taken nearest to them.
+    """Photos with the nearest ones.
 
     Args:
         positions: Latitude and longitude in degrees, of the photos that carry them.
@@ -145,10 +139,10 @@ def choose_pairs(
     config: PairingConfig,
     seed: int = 0,
 ) -> Pairing:
-    """All pairs of a small set; of a large one each photo's neighbours by GPS or by looks.
+    """All pairs of a small set; of a large one, each photo with its neighbours by GPS or by retrieval.
 
-    With GPS, a quarter of the partners still come by looks, because photos of one building from two squares
-    are neighbours in no other way; photos without a near neighbour get all of theirs so.
+    With GPS, a quarter of the partners still come from retrieval, because photos of one building from two squares
+    are far apart; photos without a near neighbour get all of their partners by it.
 
     Args:
         count: Number of photos.

@@ -16,12 +16,12 @@ from PIL import Image
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.processes import signals_as_interrupts
+from wildgs.progress import Progress, silent
 from wildgs.scene.colmap import LAYOUTS
 from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
+from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import (
-    Progress,
-    SfmConfig,
     Workplace,
     extract,
     find_registered,
@@ -30,7 +30,6 @@ from wildgs.sfm.mapping import (
     match,
     quiet,
 )
-from wildgs.sfm.pairs import PairingConfig
 from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
 
@@ -38,8 +37,6 @@ SCENE_PARTS = ("images", "sparse", "masks", REPORT_NAME)
 ASIDE, MOVED, DONE = ".replaced", ".moved", ".done"
 """Folder of the old scene while the new one takes its place, and the files in it that say that the old scene is
 complete there, and that the new one is in its place."""
-
-__all__ = ["PairingConfig", "Progress", "SfmConfig", "SfmReport", "reconstruct"]
 
 
 def reconstruct(
@@ -72,7 +69,7 @@ def reconstruct(
     Raises:
         UserError: There are fewer than two readable photos, they do not match, or `output` is in use.
     """
-    config, progress = config or SfmConfig(), progress or (lambda stage, done, total: None)
+    config, progress = config or SfmConfig(), progress or silent
     photos, output = Path(photos), Path(output)
     started = time.perf_counter()
     check_photos(photos, output)

@@ -6,8 +6,7 @@ import hashlib
 import shutil
 import unicodedata
 import warnings
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -15,6 +14,7 @@ from PIL import Image
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_file, is_unprintable, printable
+from wildgs.progress import Counter, in_threads
 from wildgs.scene.colmap import describe_names
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.images import (
@@ -142,7 +142,7 @@ def copy_upright(
     masks_dir: Path,
     *,
     max_pixels: int = MAX_IMAGE_PIXELS,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Counter | None = None,
 ) -> tuple[list[WorkingCopy], dict[str, str]]:
     """Write upright 8-bit JPEG copies of all photos; the EXIF block (focal length, GPS) goes along.
 
@@ -173,16 +173,13 @@ def copy_upright(
         return WorkingCopy(name, work_name, scene_name, masked, position)
 
     copies, broken = [], {}
-    with ThreadPoolExecutor(COPIERS) as pool:
-        for count, (name, result) in enumerate(zip(names, pool.map(copy, plans), strict=True), start=1):
-            if isinstance(result, str):
-                broken[name] = result
-                text = f"{printable(str(folder / name))}: {result}; the photo is left out"
-                warnings.warn(text, WildGSWarning, stacklevel=2)
-            else:
-                copies.append(result)
-            if progress is not None:
-                progress(count, len(names))
+    for name, result in zip(names, in_threads(copy, plans, COPIERS, progress), strict=True):
+        if isinstance(result, str):
+            broken[name] = result
+            text = f"{printable(str(folder / name))}: {result}; the photo is left out"
+            warnings.warn(text, WildGSWarning, stacklevel=2)
+        else:
+            copies.append(result)
     return copies, broken
 
 

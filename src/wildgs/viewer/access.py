@@ -1,34 +1,30 @@
-"""Access control for the viewer: a random token in the address, and checks of the Host and Origin headers.
+"""Access control: a random token, Host and Origin headers, and the messages that browsers may send.
 
 The token keeps out everyone who was not given the address. Host is checked against DNS rebinding (a name of
 another site that resolves to this machine), Origin against pages of other sites that connect from a user's browser.
+viser sets whatever attribute a message names to whatever value it carries: only messages that the viewer's own page
+sends reach it, with finite numbers and values that the control can take. Others are dropped; a connection that
+sends something that is no message at all is closed.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import math
 import secrets
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 from urllib.parse import urlsplit
 
 TOKEN_BYTES = 24
 
 
 class AccessControl:
-    """Decides which requests the viewer answers.
-
-    Attributes:
-        token: First segment of every path that is served.
-    """
+    """Decides which requests the viewer answers; `token` is the first segment of every path that is served."""
 
     def __init__(self, host: str, token: str | None = None) -> None:
-        """Sets up the access control.
-
-        Args:
-            host: Address that the server listens on.
-            token: None makes a random one.
-        """
+        """Takes the address that the server listens on; without a token, makes a random one."""
         self.token = token or secrets.token_urlsafe(TOKEN_BYTES)
         self._loopback_only = is_loopback(host)
         self._names = {"localhost", *(() if self._loopback_only else own_names(host))}
@@ -40,10 +36,8 @@ class AccessControl:
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
         """Why a request is refused, None if it is accepted.
 
-        Args:
-            path: Of the request, with the token as its first segment.
-            hosts: All values of the Host header.
-            origins: All values of the Origin header; browsers send one with every WebSocket handshake.
+        `path` has the token as its first segment; `hosts` and `origins` are all values of these headers. Browsers
+        send an Origin with every WebSocket handshake.
         """
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return "the Host header does not name this machine; use its IP address or its own name"
@@ -96,3 +90,112 @@ def _is_address(text: str) -> bool:
 
 def _first_segment(path: str) -> str:
     return path.partition("?")[0].removeprefix("/").partition("/")[0]
+
+
+MAX_MESSAGE_BYTES = 4 * 2**20
+"""Of one message; parts of uploads are 512 KiB."""
+MAX_COORDINATE = 1e6
+"""Of cameras and clicks, in scene units."""
+MAX_WINDOW = 16_384
+"""Pixels of a browser's window along one side."""
+MAX_TEXT = 1000
+
+FindControl = Callable[[str], Any]
+"""The handle of a control on the page by its id, None where there is none."""
+
+
+class MalformedMessageError(Exception):
+    """Bytes that are not a message of viser's protocol."""
+
+
+def decode(raw: object) -> dict[str, Any]:
+    """A message as a dictionary.
+
+    Raises:
+        MalformedMessageError: It is not a MessagePack map with a type.
+    """
+    import msgspec
+
+    if not isinstance(raw, bytes):
+        raise MalformedMessageError("messages are binary")
+    try:
+        message = msgspec.msgpack.decode(raw)
+    except (msgspec.DecodeError, RecursionError, ValueError, MemoryError) as error:
+        raise MalformedMessageError(str(error)) from error
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise MalformedMessageError("messages are maps with a type")
+    return message
+
+
+def is_acceptable(message: Mapping[str, Any], find_control: FindControl) -> bool:
+    """Whether viser may act on a message."""
+    fields = {name: value for name, value in message.items() if name != "type"}
+    match message["type"]:
+        case "GuiUpdateMessage":
+            return _good_update(fields, find_control)
+        case "ViewerCameraMessage":
+            return _good_camera(fields)
+        case "SceneNodeClickMessage":
+            return _good_click(fields)
+        case "GetRenderResponseMessage":
+            return _has(fields, {"payload": bytes, "render_uuid": str})
+        case _:
+            return False
+
+
+def _good_update(fields: Mapping[str, Any], find_control: FindControl) -> bool:
+    if not _has(fields, {"uuid": str, "updates": dict}) or list(fields["updates"]) != ["value"]:
+        return False
+    control = find_control(fields["uuid"])
+    return control is not None and _fits(fields["updates"]["value"], control)
+
+
+def _fits(value: Any, control: Any) -> bool:
+    """Whether a control can take a value; controls of other kinds take none."""
+    import viser
+
+    if getattr(control, "disabled", False):
+        return False
+    if isinstance(control, viser.GuiSliderHandle):
+        return _is_number(value, MAX_COORDINATE) and control.min <= value <= control.max
+    if isinstance(control, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
+        return isinstance(value, str) and value in control.options
+    return isinstance(control, viser.GuiCheckboxHandle | viser.GuiButtonHandle) and isinstance(value, bool)
+
+
+def _good_camera(fields: Mapping[str, Any]) -> bool:
+    vectors = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}
+    numbers = {"fov", "near", "far", "image_height", "image_width"}
+    if set(fields) != {*vectors, *numbers} or not _are_vectors(fields, vectors):
+        return False
+    if not all(_is_number(fields[name], 1e9) and fields[name] > 0 for name in numbers):
+        return False
+    sizes = fields["image_height"], fields["image_width"]
+    return fields["fov"] < math.pi and max(sizes) <= MAX_WINDOW and math.hypot(*fields["wxyz"]) > 1e-6
+
+
+def _good_click(fields: Mapping[str, Any]) -> bool:
+    optional = {"instance_index": int | None, "modifier": str | None}
+    vectors = {"ray_origin": 3, "ray_direction": 3, "screen_pos": 2}
+    rest = {"owner": "", **{name: value for name, value in fields.items() if name not in vectors}}
+    return _has(rest, {"name": str, "owner": str, **optional}) and _are_vectors(fields, vectors)
+
+
+def _has(fields: Mapping[str, Any], kinds: Mapping[str, Any]) -> bool:
+    """Whether a message has these fields of these types and no others, and no long text."""
+    if set(fields) != set(kinds) or not all(isinstance(fields[name], kind) for name, kind in kinds.items()):
+        return False
+    return all(len(value) <= MAX_TEXT for value in fields.values() if isinstance(value, str))
+
+
+def _are_vectors(fields: Mapping[str, Any], lengths: Mapping[str, int]) -> bool:
+    return all(
+        isinstance(fields.get(name), list)
+        and len(fields[name]) == length
+        and all(_is_number(value, MAX_COORDINATE) for value in fields[name])
+        for name, length in lengths.items()
+    )
+
+
+def _is_number(value: object, limit: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= limit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,34 +14,9 @@ from scipy.spatial.transform import Rotation
 from wildgs.geometry.camera import Camera
 
 
-@runtime_checkable
-class ViserCamera(Protocol):
-    """What is read of `viser.CameraHandle`; axes are OpenCV's, as ours."""
-
-    @property
-    def wxyz(self) -> np.ndarray:
-        """Camera-to-world rotation."""
-        ...
-
-    @property
-    def position(self) -> np.ndarray:
-        """The camera's centre."""
-        ...
-
-    @property
-    def fov(self) -> float:
-        """Vertical field of view, radians."""
-        ...
-
-    @property
-    def aspect(self) -> float:
-        """Width over height."""
-        ...
-
-
 @dataclass(frozen=True)
 class Pose:
-    """A camera as viser has it.
+    """A camera as viser has it; axes are OpenCV's, as ours.
 
     Attributes:
         wxyz: Camera-to-world rotation.
@@ -68,13 +43,10 @@ def pose_of(camera: Camera) -> Pose:
     )
 
 
-def camera_of(camera: ViserCamera, height: int, aspect: float | None = None) -> Camera:
-    """A camera of viser's as ours, on a picture of a given height.
+def camera_of(camera: Any, height: int, aspect: float | None = None) -> Camera:
+    """The camera of a client (`viser.CameraHandle`) or a `Pose` as ours, for a picture of a height in pixels.
 
-    Args:
-        camera: A client's camera, or a `Pose`.
-        height: Of the picture, pixels.
-        aspect: Width over height; None keeps the camera's.
+    `aspect` is width over height; None keeps the camera's.
     """
     width = max(1, round(height * (aspect or camera.aspect)))
     w, x, y, z = (float(value) for value in camera.wxyz)
@@ -88,6 +60,6 @@ def camera_of(camera: ViserCamera, height: int, aspect: float | None = None) -> 
 
 
 def fov_that_holds(pose: Pose, aspect: float) -> float:
-    """The vertical field of view at which a window of another shape shows all that the camera sees."""
+    """The vertical field of view at which a window of another aspect shows all that the camera sees."""
     half = math.tan(pose.fov / 2)
     return 2 * math.atan(half * max(1.0, pose.aspect / aspect))

@@ -1,34 +1,104 @@
-"""The splats in the browser: put there once, repainted when the light or the eye changes."""
+"""The Gaussians in the browser: sent once, recoloured when the light or the viewpoint changes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from wildgs.exporters.depth_colors import color_depth
+from wildgs.geometry.camera import Camera
+from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.light.look import Look
-from wildgs.viewer.splats import ENLARGED, Splats, as_viser, colors_from, distances_from, splats_of
+from wildgs.model.gaussians import Gaussians
+from wildgs.rasterize import sh_to_colors
+from wildgs.rasterize.interface import MIN_ALPHA
 from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:
     import viser
+
+ENLARGED = 10.0
+"""Factor on the sizes of splats, which their scene node undoes: covariances are sent in half precision, which is
+coarse below 6e-5, and a Gaussian as wide as a pixel at the photos' median depth has a variance of 1e-6."""
+
+_HALF_MAX = 6e4
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Geometry as viser takes it, enlarged by `ENLARGED`.
+
+    Attributes:
+        rows: Which Gaussians these are; those that no picture shows are left out.
+        means: Their centres in the aligned frame, for colours that depend on the direction; on the method's device.
+        centers: The same, enlarged.
+        covariances: World axes, enlarged.
+        opacities: In [0, 1].
+    """
+
+    rows: Int[Tensor, " M"]
+    means: Float[Tensor, "M 3"]
+    centers: Float[np.ndarray, "M 3"]
+    covariances: Float[np.ndarray, "M 3 3"]
+    opacities: Float[np.ndarray, "M 1"]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+@torch.no_grad()
+def splats_of(gaussians: Gaussians) -> Splats:
+    """Packs all Gaussians that can be seen: finite, and with an opacity of at least 1/255 as in the rasteriser."""
+    scales, opacities = gaussians.scales, gaussians.opacities
+    finite = gaussians.means.isfinite().all(dim=1) & scales.isfinite().all(dim=1)
+    finite &= gaussians.quats.isfinite().all(dim=1)
+    rows = (finite & (opacities >= MIN_ALPHA)).nonzero()[:, 0]
+    means = gaussians.means[rows].detach().clone()
+    axes = quats_to_rotations(gaussians.quats[rows]) * (scales[rows] * ENLARGED)[:, None, :]
+    covariances = (axes @ axes.transpose(1, 2)).clamp(-_HALF_MAX, _HALF_MAX)
+    return Splats(
+        rows=rows,
+        means=means,
+        centers=(means * ENLARGED).cpu().numpy(),
+        covariances=covariances.cpu().numpy(),
+        opacities=opacities[rows, None].cpu().numpy(),
+    )
+
+
+@torch.no_grad()
+def colors_from(
+    means: Float[Tensor, "M 3"], sh: Float[Tensor, "M K 3"], position: Float[Tensor, " 3"], degree: int
+) -> Float[np.ndarray, "M 3"]:
+    """Colours in [0, 1] of Gaussians with these centres as seen from a position, by harmonics up to a degree."""
+    viewmat = torch.eye(4).to(means)
+    viewmat[:3, 3] = -position.to(means)
+    camera = Camera(viewmat, torch.eye(3).to(means), 1, 1)
+    return sh_to_colors(means, sh, camera, degree=degree).clamp(0, 1).cpu().numpy()
+
+
+@torch.no_grad()
+def distances_from(means: Float[Tensor, "M 3"], position: Float[Tensor, " 3"]) -> Float[np.ndarray, " M"]:
+    """Distances of the centres from a position, world units."""
+    return (means - position.to(means)).norm(dim=1).cpu().numpy()
+
 
 Paint = Literal["colour", "depth"]
 NODE = "/splats"
 
 
 class SplatDisplay:
-    """Draws a subject's Gaussians in all browsers that look.
+    """Draws a subject's Gaussians in all clients.
 
-    viser's splats have one colour each, our Gaussians' colours depend on the direction. They are evaluated for one
-    eye, the camera that moved last, and are exact there whatever way it turns.
+    viser's splats have one colour each. Colours that depend on the direction are evaluated for one position, that
+    of the camera that moved last, and are exact there for all directions.
 
     Attributes:
-        eye: The place for which colours are evaluated, aligned frame.
+        eye: The position for which colours are evaluated, aligned frame.
         paint: What colours show.
     """
 
@@ -56,7 +126,13 @@ class SplatDisplay:
         if self._splats is None or self._sh is None:
             return
         colors = self._colors(self._splats, self._sh)
-        arguments = as_viser(self._splats, colors)
+        splats = self._splats
+        arguments: dict[str, Any] = {
+            "centers": splats.centers,
+            "covariances": splats.covariances,
+            "rgbs": colors,
+            "opacities": splats.opacities,
+        }
         if self._handle is None:
             self._handle = self._server.scene.add_gaussian_splats(NODE, **arguments, scale=1 / ENLARGED)
         else:

@@ -25,11 +25,9 @@ def spread(views: Sequence[View], count: int) -> tuple[View, ...]:
 
 
 class Gallery:
-    """Thumbnails of some photos.
+    """Thumbnails of some photos, by name.
 
     Attributes:
-        views: The photos offered.
-        names: Theirs.
         masks: Whether thumbnails show what the mask M hides, in red.
     """
 

@@ -24,8 +24,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from wildgs.errors import UserError
-from wildgs.viewer.access import AccessControl
-from wildgs.viewer.messages import MAX_MESSAGE_BYTES, MalformedMessageError, decode, is_acceptable
+from wildgs.viewer.access import (
+    MAX_MESSAGE_BYTES,
+    AccessControl,
+    MalformedMessageError,
+    decode,
+    is_acceptable,
+)
 from wildgs.viewer.uploads import Upload, Uploads
 
 POLICY_VIOLATION = 1008
@@ -40,20 +45,10 @@ _hook_lock = threading.Lock()
 
 
 class GuardedServer(viser.ViserServer):
-    """A viser server that answers only those who have its token, and acts only on sound messages.
-
-    Attributes:
-        access: Who is let in.
-        uploads: Pictures that browsers send.
-    """
+    """A viser server that answers only requests with its token, and acts only on valid messages."""
 
     def __init__(self, host: str, port: int, *, share: bool = False) -> None:
-        """Starts the server.
-
-        Args:
-            host: Address to listen on.
-            port: Port to listen on; the next free one where it is taken.
-            share: Whether viser's relay may be asked for a public address.
+        """Starts the server on the first free port from `port` on; `share` allows a public address by viser.
 
         Raises:
             UserError: The installed viser cannot be guarded.

@@ -45,13 +45,7 @@ SIDES = ("Left", "Right")
 
 @dataclass(frozen=True)
 class Light:
-    """Where a light comes from.
-
-    Attributes:
-        spec: A photo of the scene by name, or any other spec of `wildgs.light.sources`.
-        label: For people.
-        like: Whose camera a picture borrows.
-    """
+    """A light: what `LightSources.find` takes, a label, and the photo whose camera a picture borrows."""
 
     spec: str
     label: str
@@ -60,26 +54,20 @@ class Light:
 
 @dataclass(frozen=True)
 class LightDesk:
-    """Two lights and where the slider between them stands.
-
-    Attributes:
-        first: At amount 0.
-        second: At amount 1.
-        amount: In [0, 1].
-    """
+    """Two lights and the position of the slider between them: 0 is the first one, 1 the second."""
 
     first: Light
     second: Light
     amount: float = 0.0
 
     def with_light(self, light: Light, side: str) -> LightDesk:
-        """The desk with another light on one side, the slider moved there: who chooses a light wants to see it."""
+        """The desk with another light on one side, and the slider moved there."""
         if side == SIDES[0]:
             return replace(self, first=light, amount=0.0)
         return replace(self, second=light, amount=1.0)
 
     def look(self, subject: Subject) -> Look:
-        """The light as it is mixed; encodes a photo only when its light is needed.
+        """The mixed light; encodes a photo only when its light is needed.
 
         Raises:
             UserError: A light cannot be found.
@@ -104,13 +92,13 @@ class LightPanel:
         lender: Callable[[], str],
         masks_asked: Callable[[bool], None],
     ) -> None:
-        """Adds the controls to the container that is open.
+        """Adds the controls to the open container.
 
         Args:
-            server: The viewer's.
+            server: The viewer's server.
             desk: The lights to begin with.
             gallery: Photos to choose from.
-            changed: Called, on a thread of viser's, after the desk changed.
+            changed: Called on a thread of viser after the desk changed.
             lender: Names the photo whose camera a picture borrows.
             masks_asked: Called, likewise, when masks over the photos are switched on or off.
         """
@@ -163,11 +151,7 @@ class LightPanel:
             self._set(replace(self.desk, amount=min(max(float(amount), 0.0), 1.0)))
 
     def take_picture(self, name: str, content: bytes) -> None:
-        """Lights the scene like a picture that a browser sent.
-
-        Raises:
-            UserError: It cannot be used.
-        """
+        """Gives the light of a picture that a browser sent to the chosen side; `UserError` if it cannot be used."""
         self._number += 1
         folder = Path(self._uploads.name)
         file = store_upload(folder, self._number, name, content)
@@ -186,7 +170,7 @@ class LightPanel:
         self._changed()
 
     def take_back(self, desk: LightDesk) -> None:
-        """Stands as before: a light could not be found."""
+        """Restores an earlier desk: a light could not be found."""
         self.desk = desk
         self._slider.value = desk.amount
         self._refresh()
@@ -214,13 +198,7 @@ class LightPanel:
 
 
 def store_upload(folder: Path, number: int, name: str, content: bytes) -> Path:
-    """Decodes a picture that a browser sent, and writes it small, under a plain name.
-
-    Args:
-        folder: Where it goes.
-        number: Makes its name unique.
-        name: The browser's name for it, of which letters and digits are kept.
-        content: The file.
+    """Decodes a picture that a browser sent, and writes it small to a folder, under its number and a plain name.
 
     Raises:
         UserError: It cannot be read, or has too many pixels.

@@ -23,13 +23,7 @@ CHOSEN_COLORS = ("#4dabf7", "#ffa94d")
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A photo that can be clicked.
-
-    Attributes:
-        name: The photo's name.
-        source: A data URI.
-        button: Id of the element that a click goes to.
-    """
+    """A photo that can be clicked: its name, a data URI, and the id of the button that a click goes to."""
 
     name: str
     source: str
@@ -80,12 +74,9 @@ def contact_sheet(thumbnails: Sequence[Thumbnail]) -> str:
 
 
 def chosen_frames(buttons: Sequence[str | None]) -> str:
-    """Frames around the thumbnails of the first and the second light.
+    """Frames around the thumbnails of the two lights, by the ids of their buttons (None without thumbnail).
 
     Apart from the thumbnails themselves, which would scroll back to the top whenever they are sent again.
-
-    Args:
-        buttons: Ids of their buttons; None for a light that is no thumbnail.
     """
     rules = (
         f'label[for="{button}"] img{{outline:3px solid {color}}}'
@@ -124,11 +115,7 @@ def figures(pictures: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"]]], note: st
 
 
 def drop_zone(upload_button: str) -> str:
-    """Makes viser's upload button a place where files can be dropped: its own file input, shown large.
-
-    Args:
-        upload_button: Id of the button's element.
-    """
+    """Shows the file input of viser's upload button, given by its id, as an area where files can be dropped."""
     return (
         f'<style>[id="file_upload_{upload_button}"]{{display:block !important;box-sizing:border-box;width:100%;'
         "padding:18px 10px;margin-bottom:6px;border:1.5px dashed #868e96;border-radius:6px;font-size:12px;"

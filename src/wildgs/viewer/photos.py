@@ -1,22 +1,86 @@
-"""The photos in space: a frustum where each was taken, a click to stand there, and what the model makes of it."""
+"""The photos in space: frustums, viewpoints, and each photo beside its render, mask and depth."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
+from wildgs.evaluation.metrics import psnr
+from wildgs.exporters.depth_colors import color_depth, tint_hidden
 from wildgs.files import printable
+from wildgs.light.look import Look
 from wildgs.scene import View
 from wildgs.viewer.cameras import fov_that_holds, pose_of
-from wildgs.viewer.comparison import Comparison
 from wildgs.viewer.gallery import Gallery
 from wildgs.viewer.markup import figures
+from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:
     import viser
+
+LONG_SIDE = 480
+"""Long side of the pictures, pixels."""
+
+Picture = UInt8[np.ndarray, "H W 3"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Pictures of one viewpoint, all of one size.
+
+    Attributes:
+        name: The photo's.
+        photo: As it was taken.
+        render: The scene from there.
+        mask: The photo with red where the model takes it for transient; None without a mask.
+        depth: Near is bright.
+        psnr: Of the render against the photo, passers-by and all, in dB.
+        light: The name of the render's light.
+    """
+
+    name: str
+    photo: Picture
+    render: Picture
+    mask: Picture | None
+    depth: Picture
+    psnr: float
+    light: str
+
+
+@torch.no_grad()
+def compare(subject: Subject, view: View, look: Look) -> Comparison:
+    """Renders a photo's viewpoint under a light."""
+    shrink = min(1.0, LONG_SIDE / max(view.camera.width, view.camera.height))
+    width, height = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
+    pixels = _resized(view.read_photo().permute(2, 0, 1).float(), width, height)
+    photo = pixels.permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8)
+    render, rendering = subject.render(view.camera.resized(width, height), look)
+    depth = torch.where(rendering.alpha > 0.5, rendering.depth, 0.0)
+    visibility = subject.visibility(view)
+    if visibility is not None:
+        visibility = _resized(visibility[None], width, height)[0]
+    return Comparison(
+        name=view.name,
+        photo=photo.numpy(),
+        render=render.numpy(),
+        mask=None if visibility is None else tint_hidden(photo.numpy(), visibility.numpy()),
+        depth=color_depth(depth.double().cpu().numpy()),
+        psnr=psnr(render, photo),
+        light=look.name,
+    )
+
+
+def _resized(channels: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C h w"]:
+    options = {"mode": "bilinear", "antialias": True}
+    return torch.nn.functional.interpolate(channels[None], (height, width), **options)[0]
+
 
 PARENT = "/photos"
 FRUSTUM_SIZE = 0.06
@@ -36,13 +100,13 @@ class PhotoPanel:
         gallery: Gallery,
         visited: Callable[[View], None],
     ) -> None:
-        """Adds the controls to the container that is open.
+        """Adds the controls to the open container.
 
         Args:
-            server: The viewer's.
+            server: The viewer's server.
             views: All photos.
             gallery: Those that get frustums.
-            visited: Called, on a thread of viser's, when someone stands at a photo's viewpoint.
+            visited: Called on a thread of viser when a client moves to a photo's viewpoint.
         """
         self._server, self._gallery, self._visited = server, gallery, visited
         self._by_label = {printable(view.name): view for view in views}
@@ -98,7 +162,7 @@ class PhotoPanel:
             self._frustums[view.name] = frustum
 
     def visit(self, client: viser.ClientHandle | None, view: View) -> None:
-        """Puts a browser's camera where a photo was taken, and has the two compared."""
+        """Moves a client's camera to a photo's viewpoint, and requests the comparison."""
         if client is not None:
             stand_at(client, view)
         self.current = view
@@ -126,7 +190,7 @@ class PhotoPanel:
 
 
 def stand_at(client: viser.ClientHandle, view: View) -> None:
-    """Moves a browser's camera to a photo's, opened so far that the whole photo is in the window."""
+    """Moves a client's camera to a photo's, with a field of view in which the whole photo is visible."""
     pose = pose_of(view.camera)
     with client.atomic():
         client.camera.position = pose.position

@@ -1,18 +1,24 @@
-"""A camera path: keyframes are added one by one, interpolated smoothly, and rendered as a video."""
+"""A camera path: keyframes, and the video and camera file that are made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from wildgs.errors import UserError
+from wildgs.exporters.video import write_frames
 from wildgs.geometry.camera import Camera
-from wildgs.viewer.cameras import Pose, ViserCamera, camera_of
+from wildgs.geometry.camera_file import write_camera_path
+from wildgs.geometry.trajectory import interpolate
+from wildgs.viewer.cameras import Pose, camera_of
+from wildgs.viewer.lighting import LightDesk
 from wildgs.viewer.markup import escape
+from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:
     import viser
@@ -43,11 +49,7 @@ class VideoOrder:
 
 
 class RecordingPanel:
-    """The controls of a camera path, and its keyframes as frustums in the scene.
-
-    Attributes:
-        folder: Where videos go.
-    """
+    """The controls of a camera path, and its keyframes as frustums in the scene."""
 
     def __init__(
         self,
@@ -55,12 +57,12 @@ class RecordingPanel:
         folder: Path | None,
         ordered: Callable[[viser.ClientHandle | None], None],
     ) -> None:
-        """Adds the controls to the container that is open.
+        """Adds the controls to the open container.
 
         Args:
-            server: The viewer's.
-            folder: Where videos go; None while none can be made (training).
-            ordered: Called, on a thread of viser's, with the browser that wants the video.
+            server: The viewer's server.
+            folder: For videos; None while none can be made (training).
+            ordered: Called on a thread of viser, with the client that asks for the video.
         """
         self.folder = folder
         self._server, self._ordered = server, ordered
@@ -82,7 +84,7 @@ class RecordingPanel:
         self._line = gui.add_html("")
         self.tell(self._describe())
 
-    def add(self, camera: ViserCamera) -> None:
+    def add(self, camera: Any) -> None:
         """Adds a keyframe; a path that is full stays as it is."""
         if len(self._poses) >= MAX_VIEWS:
             self.tell(f"A path has at most {MAX_VIEWS} views.")
@@ -110,11 +112,7 @@ class RecordingPanel:
         self.tell(self._describe())
 
     def order(self) -> VideoOrder:
-        """The video as the controls describe it.
-
-        Raises:
-            UserError: The path has too few views, or the video would be too long or too large.
-        """
+        """The video as the controls describe it; raises `UserError` if it has too few views or is too long."""
         if len(self._poses) < MIN_VIEWS:
             raise UserError(
                 "a path needs at least two views: add this view, fly somewhere else, and add that one"
@@ -141,3 +139,54 @@ class RecordingPanel:
         if count < MIN_VIEWS:
             return f"{count} of at least two views. Fly somewhere and add the view."
         return f"{count} views"
+
+
+FPS = 30.0
+
+
+def make_film(
+    subject: Subject, desk: LightDesk, order: VideoOrder, file: Path, progress: Callable[[int, int], bool]
+) -> Path:
+    """Renders a video along the keyframes, and writes the camera file beside it (the same name, .json).
+
+    Args:
+        subject: The scene.
+        desk: Its light.
+        order: Settings of the video.
+        file: The video.
+        progress: Called with (frames done, frames in all) after every frame; False stops.
+
+    Raises:
+        UserError: The video cannot be written, or `progress` stopped it. No file is left then.
+    """
+    height = order.keyframes[0].height
+    width = 2 * round(height * ASPECT / 2)
+    cameras = interpolate(order.keyframes, max(2, round(order.seconds * FPS)), width, height)
+    write_frames(file, _frames(subject, desk, order.relight, cameras, progress), (width, height), FPS)
+    write_camera_path(file.with_suffix(".json"), cameras, fps=FPS)
+    return file
+
+
+def free_name(folder: Path) -> Path:
+    """The next name for a video in a folder."""
+    number = 1
+    while (file := folder / f"path_{number:03d}.mp4").exists():
+        number += 1
+    return file
+
+
+def _frames(
+    subject: Subject,
+    desk: LightDesk,
+    relight: bool,
+    cameras: list[Camera],
+    progress: Callable[[int, int], bool],
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    look = desk.look(subject)
+    for number, camera in enumerate(cameras):
+        if relight:
+            look = replace(desk, amount=number / (len(cameras) - 1)).look(subject)
+        picture, _ = subject.render(camera, look)
+        yield picture.numpy()
+        if not progress(number + 1, len(cameras)):
+            raise UserError("the video was not finished: the viewer was closed")

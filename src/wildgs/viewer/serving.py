@@ -1,28 +1,104 @@
-"""`wildgs.view`, and the viewer beside a training: a page opened, kept up to date and closed."""
+"""`wildgs.view`, and the viewer of a training: the server, its address, and the life of a page."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
+import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+import numpy as np
 
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError
+from wildgs.files import printable
 from wildgs.library.loaded import LoadedScene, load
 from wildgs.processes import TerminatedError, signals_as_interrupts
 from wildgs.scene import Scene
-from wildgs.viewer.config import ServerConfig, ViewerConfig
-from wildgs.viewer.jobs import start_worker
-from wildgs.viewer.server import address, open_server, public_address
+from wildgs.viewer.config import LOCAL, ServerConfig, ViewerConfig
+from wildgs.viewer.jobs import TrainingTurns, start_worker
 from wildgs.viewer.subject import Subject, TrainingSubject
-from wildgs.viewer.training import TrainingTurns
 from wildgs.viewer.viewer import Viewer
 
 if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
+
+REMEDY = "the viewer needs viser: pip install 'wildgs[viewer]'"
+
+
+def open_server(config: ServerConfig, title: str) -> GuardedServer:
+    """Starts an empty viewer page with a title.
+
+    Raises:
+        UserError: viser is not installed, the address is not one of this machine's, or sharing failed.
+    """
+    import_viser()
+    from wildgs.viewer.guarded import GuardedServer
+
+    _check_address(config)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser greets in a box of its own
+        server = GuardedServer(config.host, config.port, share=config.share)
+    if config.share:
+        public = server.request_share_url(verbose=False)
+        if public is None:
+            server.stop()
+            raise UserError(
+                "viser's relay gave no public address; leave --share out and use the local address"
+            )
+        server.access.allow_name(urlsplit(public).hostname or "")
+    # viser's own share dialog would show the public address without the token.
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    server.gui.set_panel_label(printable(title))
+    server.scene.set_up_direction("+z")
+    # What no Gaussian covers is black, as the rasteriser has it.
+    server.scene.set_background_image(np.zeros((2, 2, 3), dtype=np.uint8), format="png")
+    return server
+
+
+def address(server: GuardedServer, config: ServerConfig) -> str:
+    """The address for a browser on this machine, with the viewer's token."""
+    host = LOCAL if config.host in ("0.0.0.0", "::", "") else config.host
+    local = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
+    return f"{local}/{server.access.token}/"
+
+
+def public_address(server: GuardedServer, config: ServerConfig) -> str | None:
+    """The address at viser's relay, None unless the viewer is shared."""
+    public = server.request_share_url(verbose=False) if config.share else None
+    return None if public is None else f"{public.rstrip('/')}/{server.access.token}/"
+
+
+def import_viser():
+    """Imports viser, an optional dependency; raises `UserError` if it is not installed."""
+    try:
+        return importlib.import_module("viser")
+    except ModuleNotFoundError as error:
+        if error.name != "viser":
+            raise
+        raise UserError(REMEDY) from error
+
+
+def _check_address(config: ServerConfig) -> None:
+    """Rejects an impossible address, for which viser would try a thousand ports."""
+    if not 0 <= config.port <= 65535:
+        raise UserError(f"--port {config.port}: ports are 0 to 65535, 0 for any free one")
+    try:
+        family, kind, protocol, _, target = socket.getaddrinfo(config.host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as trial:
+            trial.bind(target)
+    except OSError as error:
+        raise UserError(
+            f"--host {config.host}: this machine has no such address; use {LOCAL} for local access only,"
+            " 0.0.0.0 for all interfaces"
+        ) from error
+
 
 VIDEO_FOLDER = "videos"
 
@@ -32,15 +108,9 @@ import_module("pycolmap")
 
 
 class OpenViewer:
-    """A run's page that is being served.
-
-    Attributes:
-        viewer: The page.
-        urls: Where it is reached.
-    """
+    """A page that is being served at `urls`; use `view` to open one."""
 
     def __init__(self, viewer: Viewer, urls: Sequence[str]) -> None:
-        """Sets up an `OpenViewer`; `view` opens one."""
         self.viewer, self.urls = viewer, tuple(urls)
         self._worker: threading.Thread | None = None
 
@@ -111,22 +181,16 @@ def view(
 
 
 def addresses(server: GuardedServer, config: ServerConfig) -> list[str]:
-    """What to type into a browser: on this machine, and anywhere where the page is shared."""
+    """The addresses of the page: on this machine, and the public one if the page is shared."""
     found = (address(server, config), public_address(server, config))
     return [url for url in found if url is not None]
 
 
 class TrainingWindow:
-    """A page beside a training: it shows the training while it runs, and what was trained afterwards."""
+    """A page that shows a training while it runs, and its result afterwards."""
 
     def __init__(self, server: ServerConfig, title: str, announce: Callable[[str], None]) -> None:
-        """Sets up a `TrainingWindow`.
-
-        Args:
-            server: Where the page is reached.
-            title: Stands above the controls.
-            announce: Called with a line that says where the page is.
-        """
+        """Takes the page's address and title, and a function that prints where the page is."""
         self._config, self._title, self._announce = server, title, announce
         self._open: OpenViewer | None = None
         self._status = ""
@@ -163,7 +227,7 @@ class TrainingWindow:
         self._status = f"trained {trainer.step:,} steps, {len(trainer.method.gaussians):,} Gaussians"
 
     def stay(self) -> None:
-        """Keeps showing what was trained, until Ctrl-C."""
+        """Keeps showing the result, until Ctrl-C."""
         if self._open is not None:
             self._open.viewer.set_status(self._status)
             self._open.viewer.ask_for_update()

@@ -1,11 +1,10 @@
-"""What the viewer shows: a method among its photos, trained or still training."""
+"""What the viewer shows: a method with its photos, trained or in training."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, UInt8
@@ -21,26 +20,11 @@ from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, match_view
 
 
-@runtime_checkable
-class FindLook(Protocol):
-    """How a look is found by what a user writes."""
-
-    def __call__(self, spec: str | Path, *, like: str | None = None) -> Look:
-        """See `wildgs.light.sources.LightSources.find`."""
-        ...
-
-
 class Subject:
-    """A trained method among its photos."""
+    """A trained method with its photos."""
 
-    def __init__(self, method: Method, scene: Scene, find_look: FindLook | None = None) -> None:
-        """Sets up a `Subject`.
-
-        Args:
-            method: What is shown.
-            scene: Its photos.
-            find_look: `LoadedScene.appearance`, or the like; None looks among the scene's photos and files.
-        """
+    def __init__(self, method: Method, scene: Scene, find_look: Callable[..., Look] | None = None) -> None:
+        """Shows a method; `find_look` is as `LightSources.find`, which it is for the scene by default."""
         self.method = method
         self.scene = scene
         self.sh_degree = method.sh_degree
@@ -63,7 +47,7 @@ class Subject:
 
     @property
     def version(self) -> int:
-        """Grows whenever the method has changed: what was computed before fits no longer."""
+        """Changes when the method changes and what was computed from it is out of date."""
         return 0
 
     def look(self, spec: str | Path, like: str | None = None) -> Look:
@@ -88,15 +72,10 @@ class Subject:
 
 
 class TrainingSubject(Subject):
-    """A method while it trains: seen as its training sees it, and only between two steps."""
+    """A method in training: rendered at the present stage of its schedule, between two steps."""
 
     def __init__(self, trainer: Trainer, scene: Scene) -> None:
-        """Sets up a `TrainingSubject`.
-
-        Args:
-            trainer: Must not be in the middle of a step when any method of this class is called.
-            scene: Its photos.
-        """
+        """Shows a trainer's method, which must not be in the middle of a step when this class is called."""
         super().__init__(trainer.method, scene)
         self._trainer = trainer
         self._explicit = True
@@ -109,7 +88,7 @@ class TrainingSubject(Subject):
         return self._trainer.step
 
     def _catch_up(self) -> None:
-        """Forgets looks of earlier steps, which may have had other Gaussians, and takes over the stage."""
+        """Drops looks of earlier steps, which may have had other Gaussians, and updates the stage."""
         if self._step == self._trainer.step:
             return
         self._step = self._trainer.step
@@ -118,7 +97,7 @@ class TrainingSubject(Subject):
         self._find_look = LightSources(self.method, lambda: self.scene).find
 
     def look(self, spec: str | Path, like: str | None = None) -> Look:
-        """As `Subject.look`; without local light as long as training is without it."""
+        """As `Subject.look`, without local appearance in the first stage of training."""
         self._catch_up()
         with self._inference():
             if self._explicit or not self.relightable:

@@ -22,7 +22,7 @@ MAX_NAME = 255
 
 @runtime_checkable
 class Replies(Protocol):
-    """What a browser is told about its upload."""
+    """Notifies a browser of the state of its upload."""
 
     def progress(self, connection: Hashable, upload: Upload, received: int) -> None:
         """So many bytes were received; all of them means that the upload has succeeded."""
@@ -59,18 +59,13 @@ class Upload:
 
 
 class Uploads:
-    """Collects the parts of uploads, and hands finished ones to the control that asked for them.
+    """Collects the parts of uploads, and passes finished ones to the control that they are for.
 
     `start`, `part` and `drop` are called on the server's own thread only; finished uploads are used one after the
-    other on a thread of their own, so that no two large pictures are decoded at once.
+    other on a thread of their own, so that no two large pictures are decoded at once. `replies` notifies browsers.
     """
 
     def __init__(self, replies: Replies) -> None:
-        """Sets up the uploads.
-
-        Args:
-            replies: Tells browsers how their uploads go.
-        """
         self._replies = replies
         self._receivers: dict[str, Callable[[str, bytes], None]] = {}
         self._open: dict[tuple[Hashable, str], Upload] = {}
@@ -78,12 +73,7 @@ class Uploads:
         self._finishing: set[Upload] = set()
 
     def receive(self, button: str, receiver: Callable[[str, bytes], None]) -> None:
-        """Has uploads of a control received.
-
-        Args:
-            button: The control's id.
-            receiver: Called with name and content; raises `UserError` for what it cannot use.
-        """
+        """Sets the receiver of a control's uploads (name, content); it raises `UserError` for unusable ones."""
         self._receivers[button] = receiver
 
     def start(self, connection: Hashable, message: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
-"""The viewer whole: a server, a subject, panels, and who does what on which thread.
+"""The viewer's page: panels around a server and a subject, and which thread does what.
 
-viser calls back on threads of its own. They only change small state and ask for work; whatever touches the method
-goes through one queue of jobs and is done by one thread: a worker's, or the trainer's between two steps.
+viser calls back on threads of its own, which only change small state and queue jobs. All work on the method is done
+by one thread: a worker's, or the trainer's between two steps.
 """
 
 from __future__ import annotations
@@ -10,27 +10,25 @@ import threading
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from wildgs.errors import UserError
+from wildgs.exporters.page import choose_start
 from wildgs.files import printable
-from wildgs.geometry.lens import focus
 from wildgs.model.gaussians import NEAR
-from wildgs.scene import Scene, View
-from wildgs.viewer.cameras import ViserCamera, pose_of
-from wildgs.viewer.comparison import compare
+from wildgs.scene import View
+from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.config import ViewerConfig
 from wildgs.viewer.display import Paint, SplatDisplay
-from wildgs.viewer.film import free_name, make_film
 from wildgs.viewer.gallery import Gallery, spread
 from wildgs.viewer.jobs import Job, Jobs
 from wildgs.viewer.lighting import Light, LightDesk, LightPanel, most_different
 from wildgs.viewer.markup import escape
-from wildgs.viewer.photos import PhotoPanel
-from wildgs.viewer.recording import RecordingPanel
+from wildgs.viewer.photos import PhotoPanel, compare
+from wildgs.viewer.recording import RecordingPanel, free_name, make_film
 from wildgs.viewer.subject import Subject
 
 if TYPE_CHECKING:
@@ -39,9 +37,9 @@ if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
 
 REPAINT_SECONDS = 0.4
-"""While the camera moves, colours follow no more often: each time, all splats are sent anew."""
+"""Least time between updates of colours while the camera moves: each update sends all splats."""
 REPAINT_DISTANCE = 0.01
-"""In the photos' usual depth; a shorter way changes no direction by more than about half a degree."""
+"""Movement of the camera, in the photos' median depth, that changes directions by about half a degree."""
 FAR = 1000.0
 PAINTS: tuple[Paint, ...] = ("colour", "depth")
 
@@ -61,12 +59,12 @@ class Viewer:
         """Builds the page.
 
         Args:
-            server: Empty.
-            subject: What is shown.
-            config: How.
-            lights: Up to two specs of lights to begin with; the rest is chosen from the photos.
+            server: A server with an empty page.
+            subject: The scene that is shown.
+            config: Contents of the page.
+            lights: Up to two appearances to begin with; others are chosen from the photos.
             status: A line about the subject.
-            videos: Where videos go; None where none can be made (training).
+            videos: Folder for videos; None if none can be made (training).
         """
         self.server, self.subject = server, subject
         self.jobs = Jobs()
@@ -75,8 +73,9 @@ class Viewer:
         self._closing = threading.Event()
         self._lit_by: LightDesk | None = None
         self.gallery = Gallery(spread(subject.views, max(config.photos, 1)))
-        start, distance = overview(subject.scene)
-        self._set_start(start, distance)
+        number, depth = choose_start([view.camera for view in subject.views], subject.scene.points)
+        start = subject.views[number]
+        self._set_start(start, max(depth, 10 * NEAR))
         self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
         self._build(lights, status, videos)
         server.on_client_connect(self._greet)
@@ -112,7 +111,7 @@ class Viewer:
         return LightDesk(Light(first, Path(first).name), Light(second, Path(second).name))
 
     def _nearest_photo(self) -> str:
-        """The photo taken nearest to where somebody looks from: a picture is draped over what it shows."""
+        """The photo taken nearest to the camera: a picture of another place borrows its camera and depth."""
         positions = torch.stack([view.camera.position.cpu() for view in self.subject.views])
         return self.subject.views[int((positions - self.display.eye).norm(dim=1).argmin())].name
 
@@ -123,12 +122,12 @@ class Viewer:
         camera.up = np.array([0.0, 0.0, 1.0])
         camera.fov, camera.near, camera.far = pose.fov, NEAR, FAR
 
-    # What viser's threads call: state, and requests for work.
+    # Called on viser's threads: change state and queue jobs.
 
     def _greet(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(self._camera_moved)
 
-    def _camera_moved(self, camera: ViserCamera) -> None:
+    def _camera_moved(self, camera: Any) -> None:
         eye = torch.from_numpy(np.asarray(camera.position, dtype=np.float64)).float()
         if (eye - self.display.eye).norm() < REPAINT_DISTANCE:
             return
@@ -163,7 +162,7 @@ class Viewer:
             self._ask("masks", self._mask_thumbnails)
 
     def ask_for_update(self) -> None:
-        """Has the subject's present state shown: its Gaussians, its light encoded anew, the photo in question."""
+        """Queues an update of the Gaussians, the light and the comparison to the subject's present state."""
         self._ask("light", self._relight)
         if self.gallery.masks:
             self._masks_asked(True)
@@ -175,17 +174,17 @@ class Viewer:
         self._status.content = f'<div style="font-size:12px;margin:2px 12px 6px">{escape(text)}</div>'
 
     def complain(self, message: str) -> None:
-        """Shows a line in every browser: something could not be done."""
+        """Notifies all clients of an error."""
         for client in self.server.get_clients().values():
             client.add_notification("Failed", printable(message), color="red", auto_close_seconds=15)
 
     def _ask(self, kind: str, job: Job) -> None:
         self.jobs.put(kind, lambda: self._try(job))
 
-    # What the one working thread does.
+    # Called on the working thread.
 
     def _try(self, job: Job) -> None:
-        """A job that fails must end neither the worker nor the training."""
+        """Does a job; its failure must end neither the worker nor the training."""
         try:
             job()
         except UserError as error:
@@ -222,15 +221,15 @@ class Viewer:
             return
         order = panel.order()
 
-        def told(done: int, total: int) -> bool:
+        def report(done: int, total: int) -> bool:
             if done % 5 == 0 or done == total:
                 panel.tell(f"frame {done} of {total}")
             return not self._closing.is_set()
 
         try:
-            file = make_film(self.subject, self.lighting.desk, order, free_name(panel.folder), told)
+            file = make_film(self.subject, self.lighting.desk, order, free_name(panel.folder), report)
         except Exception:
-            panel.tell("there is no video")
+            panel.tell("the video was not made")
             raise
         panel.tell(f"written: {file}")
         if client is not None:
@@ -253,7 +252,7 @@ class Viewer:
             self._ask("masks", self._mask_thumbnails)
 
     def close(self) -> None:
-        """Ends the work and the server."""
+        """Stops the queue and the server."""
         self._closing.set()
         self.jobs.close()
         with self._lock:
@@ -261,24 +260,3 @@ class Viewer:
                 self._timer.cancel()
         self.lighting.close()
         self.server.stop()
-
-
-def overview(scene: Scene) -> tuple[View, float]:
-    """A photo that shows the landmark from afar, and how far away that is: where flying begins.
-
-    Of the photos taken from beyond the usual distance it is the one that looks most straight at what all look at.
-    """
-    target = torch.from_numpy(
-        focus([view.camera for view in scene.views], scene.points.median(dim=0).values.double().numpy())
-    ).float()
-    ahead = [target - view.camera.position.cpu() for view in scene.views]
-    distances = torch.stack([offset.norm() for offset in ahead])
-    cosines = torch.stack(
-        [
-            view.camera.forward.cpu() @ offset / offset.norm().clamp_min(1e-6)
-            for view, offset in zip(scene.views, ahead, strict=True)
-        ]
-    )
-    far = (distances >= distances.median()) & (distances <= distances.quantile(0.9))
-    best = int(torch.where(far, cosines, cosines - 2).argmax())
-    return scene.views[best], max(float(distances[best]), 10 * NEAR)

@@ -154,12 +154,7 @@ def gather_pair(
     zero = splat(0.0)
     x, y, level = splat(batch[X + i]), splat(batch[Y + i]), splat(batch[LEVEL + i])
     A, B, C = splat(batch[QA + i]), splat(batch[QB + i]), splat(batch[QC + i])
-    depth, red, green, blue = (
-        batch[DEPTH + i],
-        batch[RED + i],
-        batch[GREEN + i],
-        batch[BLUE + i],
-    )
+    depth, red, green, blue = (batch[DEPTH + i], batch[RED + i], batch[GREEN + i], batch[BLUE + i])
     q0, qx, qy, qxx, qxy, qyy = zero, zero, zero, zero, zero, zero
     abs_x, abs_y, v_d, v_red, v_green, v_blue = zero, zero, zero, zero, zero, zero
     if channels != 3:
@@ -168,10 +163,7 @@ def gather_pair(
         block = lowest_bit(blocks)
         blocks &= blocks - 1
         at = block * stride
-        dx, dy = (
-            vload(places, block * 2 * LANES) + x,
-            vload(places, block * 2 * LANES + LANES) + y,
-        )
+        dx, dy = (vload(places, block * 2 * LANES) + x, vload(places, block * 2 * LANES + LANES) + y)
         exponent = fma(dx, fma(dx, A, dy * B), fma(dy * C, dy, level))
         hit = (exponent >= MIN_LEVEL) & (vload(v, at + REACHED) >= position)
         raw = vexp2(exponent)

@@ -1,4 +1,4 @@
-"""Blending on the CPU: torch tensors in and out, kernels inside, the gradient by hand."""
+"""Blending on the CPU: the autograd function around its kernels."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.rasterize.cpu import backward_kernels, forward_kernels, tile_kernels
-from wildgs.rasterize.cpu.projection import TileLists
+from wildgs.rasterize.cpu.projection import TileLists, scratch
 from wildgs.rasterize.cpu.reach_kernels import TILE
-from wildgs.rasterize.cpu.scratch import scratch
 from wildgs.rasterize.interface import Projection, Rendering
 from wildgs.threads import flat, launch
 
@@ -38,11 +37,7 @@ class _Blend(torch.autograd.Function):
         pictures = _blend_pictures(projection, colors, background, with_depth, bookkeeping=True)
         out_colors, out_depth, out_alpha, transmittance, last = pictures
         ctx.save_for_backward(conics, depths, opacities, colors, background, out_depth, out_alpha)
-        ctx.tiles, ctx.camera, ctx.absgrad = (
-            tiles,
-            projection.camera,
-            projection.absgrad,
-        )
+        ctx.tiles, ctx.camera, ctx.absgrad = (tiles, projection.camera, projection.absgrad)
         ctx.transmittance, ctx.last, ctx.with_depth = transmittance, last, with_depth
         return out_colors, out_depth, out_alpha
 
@@ -55,11 +50,7 @@ class _Blend(torch.autograd.Function):
         # Rows are padded to whole vectors.
         stride = -(-(backward_kernels.ROW_COLORS + channels) // 16) * 16
         v_means2d, v_conics = torch.empty(n, 2), torch.empty(n, 3)
-        v_opacities, v_depths, v_values = (
-            torch.empty(n),
-            torch.empty(n),
-            torch.empty(n, channels),
-        )
+        v_opacities, v_depths, v_values = (torch.empty(n), torch.empty(n), torch.empty(n, channels))
         absgrad = None if ctx.absgrad is None else flat(ctx.absgrad)
         with scratch("rows", tiles.pairs * stride, np.float32) as rows:
             launch(
@@ -78,16 +69,7 @@ class _Blend(torch.autograd.Function):
         v_background = None
         if ctx.needs_input_grad[5]:
             v_background = ((1 - out_alpha)[..., None] * v_colors).sum((0, 1))
-        return (
-            v_means2d,
-            v_conics,
-            v_depths,
-            v_opacities,
-            v_values,
-            v_background,
-            None,
-            None,
-        )
+        return (v_means2d, v_conics, v_depths, v_opacities, v_values, v_background, None, None)
 
 
 def _rank_values(tiles: TileLists, depths: Tensor, colors: Tensor) -> np.ndarray:
@@ -102,11 +84,7 @@ def _rank_values(tiles: TileLists, depths: Tensor, colors: Tensor) -> np.ndarray
 
 
 def _blend_pictures(
-    projection: Projection,
-    colors: Tensor,
-    background: Tensor,
-    with_depth: bool,
-    bookkeeping: bool,
+    projection: Projection, colors: Tensor, background: Tensor, with_depth: bool, bookkeeping: bool
 ) -> Any:
     """Runs the forward kernel; gives colours, depth, alpha, final transmittance and last positions."""
     tiles: TileLists = projection.tiles
@@ -131,20 +109,12 @@ def _blend_pictures(
 
 
 def blend(
-    projection: Projection,
-    colors: Float[Tensor, "N C"],
-    background: Float[Tensor, "C"] | None,
-    depth: bool,
+    projection: Projection, colors: Float[Tensor, "N C"], background: Float[Tensor, "C"] | None, depth: bool
 ) -> Rendering:
     """See `wildgs.rasterize.blend`."""
     if background is None:
         background = colors.new_zeros(colors.shape[1])
-    geometry = (
-        projection.means2d,
-        projection.conics,
-        projection.depths,
-        projection.opacities,
-    )
+    geometry = (projection.means2d, projection.conics, projection.depths, projection.opacities)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*geometry, colors, background)):
         pictures = _Blend.apply(*geometry, colors, background, projection, depth)
     else:

@@ -44,17 +44,7 @@ def matmul(a, b):
 @njit(nogil=True)
 def camera_numbers(view):
     """The world-to-camera rotation as a tuple, from the flat 3 x 4 matrix."""
-    return (
-        view[0],
-        view[1],
-        view[2],
-        view[4],
-        view[5],
-        view[6],
-        view[8],
-        view[9],
-        view[10],
-    )
+    return (view[0], view[1], view[2], view[4], view[5], view[6], view[8], view[9], view[10])
 
 
 @njit(nogil=True)
@@ -84,10 +74,7 @@ def footprint(i, quats, scales, R, lens, width, height, x, y, z, iz):
     V = matmul(R, rotation(w, qx, qy, qz))
     s0, s1, s2 = vload3(scales, 3 * i)
     limits = clamp_limits(lens, width, height)
-    tx, ty = (
-        vmin(vmax(x * iz, limits[0]), limits[1]),
-        vmin(vmax(y * iz, limits[2]), limits[3]),
-    )
+    tx, ty = (vmin(vmax(x * iz, limits[0]), limits[1]), vmin(vmax(y * iz, limits[2]), limits[3]))
     jx, jy = lens[0] * iz, lens[1] * iz
     u = (
         jx * (V[0] - tx * V[6]) * s0, jx * (V[1] - tx * V[7]) * s1, jx * (V[2] - tx * V[8]) * s2,

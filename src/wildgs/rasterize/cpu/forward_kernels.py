@@ -58,20 +58,12 @@ def load_batch(begin, count, entries, records, values, channels, tx, ty, batch):
         r, v = rank * RECORD, rank * row
         batch[X + i] = origin_x - records[r]
         batch[Y + i] = origin_y - records[r + 1]
-        batch[QA + i], batch[QB + i], batch[QC + i] = (
-            records[r + 2],
-            records[r + 3],
-            records[r + 4],
-        )
+        batch[QA + i], batch[QB + i], batch[QC + i] = (records[r + 2], records[r + 3], records[r + 4])
         batch[LEVEL + i] = records[r + 5]
         batch[Y_PER_X + i], batch[X_PER_Y + i] = records[r + 6], records[r + 7]
         batch[DEPTH + i] = values[v]
         if channels == 3:
-            batch[RED + i], batch[GREEN + i], batch[BLUE + i] = (
-                values[v + 1],
-                values[v + 2],
-                values[v + 3],
-            )
+            batch[RED + i], batch[GREEN + i], batch[BLUE + i] = (values[v + 1], values[v + 2], values[v + 3])
 
 
 @njit(nogil=True)
@@ -81,16 +73,8 @@ def reach_by_block(count, batch, words):
     four, three = np.float32(4.0), np.float32(3.0)
     for group in range(0, count, LANES):
         valid = (1 << min(count - group, LANES)) - 1
-        x, y, level = (
-            vload(batch, X + group),
-            vload(batch, Y + group),
-            vload(batch, LEVEL + group),
-        )
-        A, B, C = (
-            vload(batch, QA + group),
-            vload(batch, QB + group),
-            vload(batch, QC + group),
-        )
+        x, y, level = (vload(batch, X + group), vload(batch, Y + group), vload(batch, LEVEL + group))
+        A, B, C = (vload(batch, QA + group), vload(batch, QB + group), vload(batch, QC + group))
         y_per_x, x_per_y = vload(batch, Y_PER_X + group), vload(batch, X_PER_Y + group)
         for row in range(4):
             y0 = y + four * np.float32(row)
@@ -177,11 +161,7 @@ def blend_forward(
                         first = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
                             to = at + (k + 3) * LANES
-                            vstore(
-                                sums,
-                                to,
-                                fma(weight, values[first + k], vload(sums, to)),
-                            )
+                            vstore(sums, to, fma(weight, values[first + k], vload(sums, to)))
                 vstore(sums, at, before)
                 vstore(sums, at + LANES, total)
                 vstore(sums, at + 2 * LANES, depth)

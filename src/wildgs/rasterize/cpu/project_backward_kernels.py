@@ -88,42 +88,19 @@ def project_group_backward(
     v_s0, v_s1 = k0 * V[0] + l0 * V[3] + m0 * V[6], k1 * V[1] + l1 * V[4] + m1 * V[7]
     v_s2 = k2 * V[2] + l2 * V[5] + m2 * V[8]
     zero = splat(0.0)
-    vstore3(
-        v_scales,
-        3 * i,
-        (select(ok, v_s0, zero), select(ok, v_s1, zero), select(ok, v_s2, zero)),
-    )
+    vstore3(v_scales, 3 * i, (select(ok, v_s0, zero), select(ok, v_s1, zero), select(ok, v_s2, zero)))
 
     # V = R R_q: gradient of R_q is R^T applied to the gradient of V.
     transposed = (R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8])
-    Q = matmul(
-        transposed,
-        (
-            k0 * s0,
-            k1 * s1,
-            k2 * s2,
-            l0 * s0,
-            l1 * s1,
-            l2 * s2,
-            m0 * s0,
-            m1 * s1,
-            m2 * s2,
-        ),
-    )
+    Q = matmul(transposed, (k0 * s0, k1 * s1, k2 * s2, l0 * s0, l1 * s1, l2 * s2, m0 * s0, m1 * s1, m2 * s2))
     v_w = 2.0 * (qx * (Q[7] - Q[5]) + qy * (Q[2] - Q[6]) + qz * (Q[3] - Q[1]))
     v_x = 2.0 * (-2.0 * qx * (Q[4] + Q[8]) + qy * (Q[1] + Q[3]) + qz * (Q[2] + Q[6]) + qw * (Q[7] - Q[5]))
     v_y = 2.0 * (qx * (Q[1] + Q[3]) - 2.0 * qy * (Q[0] + Q[8]) + qz * (Q[5] + Q[7]) + qw * (Q[2] - Q[6]))
     v_z = 2.0 * (qx * (Q[2] + Q[6]) + qy * (Q[5] + Q[7]) - 2.0 * qz * (Q[0] + Q[4]) + qw * (Q[3] - Q[1]))
     along = v_w * qw + v_x * qx + v_y * qy + v_z * qz
     shrink = select(ok, shrink, zero)
-    v_w, v_x = (
-        select(ok, v_w - along * qw, zero) * shrink,
-        select(ok, v_x - along * qx, zero) * shrink,
-    )
-    v_y, v_z = (
-        select(ok, v_y - along * qy, zero) * shrink,
-        select(ok, v_z - along * qz, zero) * shrink,
-    )
+    v_w, v_x = (select(ok, v_w - along * qw, zero) * shrink, select(ok, v_x - along * qx, zero) * shrink)
+    v_y, v_z = (select(ok, v_y - along * qy, zero) * shrink, select(ok, v_z - along * qz, zero) * shrink)
     vstore4(v_quats, 4 * i, (v_w, v_x, v_y, v_z))
 
     # Through the Jacobian: jx = fx/z, tx = clamp(x/z); a clamped tx does not move.
@@ -138,13 +115,6 @@ def project_group_backward(
     v_ty = select((y * iz >= limits[2]) & (y * iz <= limits[3]), v_ty, 0.0) + lens[1] * v_my
     v_cx, v_cy = v_tx * iz, v_ty * iz
     v_cz = vload(v_depths, i) - iz * (x * v_cx + y * v_cy + jx * v_jx + jy * v_jy)
-    v_px, v_py = (
-        R[0] * v_cx + R[3] * v_cy + R[6] * v_cz,
-        R[1] * v_cx + R[4] * v_cy + R[7] * v_cz,
-    )
+    v_px, v_py = (R[0] * v_cx + R[3] * v_cy + R[6] * v_cz, R[1] * v_cx + R[4] * v_cy + R[7] * v_cz)
     v_pz = R[2] * v_cx + R[5] * v_cy + R[8] * v_cz
-    vstore3(
-        v_means,
-        3 * i,
-        (select(ok, v_px, zero), select(ok, v_py, zero), select(ok, v_pz, zero)),
-    )
+    vstore3(v_means, 3 * i, (select(ok, v_px, zero), select(ok, v_py, zero), select(ok, v_pz, zero)))

@@ -26,16 +26,7 @@ from wildgs.rasterize.cpu.reach_kernels import (
     nearest_exponent,
     window_mask,
 )
-from wildgs.rasterize.cpu.simd import (
-    mask_bits,
-    select,
-    splat,
-    vfloor,
-    vlog2,
-    vmax,
-    vmin,
-    vsqrt,
-)
+from wildgs.rasterize.cpu.simd import mask_bits, select, splat, vfloor, vlog2, vmax, vmin, vsqrt
 from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore2, vstore3, vstore8
 from wildgs.threads import fetch_add
 
@@ -141,13 +132,7 @@ def project_group(
     vstore(depths, i, select(seen, z, zero))
     vstore2(means2d, 2 * i, (select(seen, mx, zero), select(seen, my, zero)))
     vstore3(
-        conics,
-        3 * i,
-        (
-            select(seen, conic_a, zero),
-            select(seen, conic_b, zero),
-            select(seen, conic_c, zero),
-        ),
+        conics, 3 * i, (select(seen, conic_a, zero), select(seen, conic_b, zero), select(seen, conic_c, zero))
     )
     radius = vmin(-vfloor(-vmax(hx, hy)), 1e9)
     vstore(spans, 0, select(seen, vmax(radius, 1.0), zero))
@@ -159,19 +144,10 @@ def project_group(
 
     # Pixels whose centres lie in the ellipse's box, then their tiles; there may be no such pixel.
     left, top = -vfloor(-vmax(mx - hx - 0.5, 0.0)), -vfloor(-vmax(my - hy - 0.5, 0.0))
-    right, bottom = (
-        vfloor(vmin(mx + hx - 0.5, width - 1.0)),
-        vfloor(vmin(my + hy - 0.5, height - 1.0)),
-    )
+    right, bottom = (vfloor(vmin(mx + hx - 0.5, width - 1.0)), vfloor(vmin(my + hy - 0.5, height - 1.0)))
     seen = seen & (left <= right) & (top <= bottom)
-    x0, y0 = (
-        vfloor(select(seen, left, zero) * 0.0625),
-        vfloor(select(seen, top, zero) * 0.0625),
-    )
-    x1, y1 = (
-        vfloor(select(seen, right, zero) * 0.0625),
-        vfloor(select(seen, bottom, zero) * 0.0625),
-    )
+    x0, y0 = (vfloor(select(seen, left, zero) * 0.0625), vfloor(select(seen, top, zero) * 0.0625))
+    x1, y1 = (vfloor(select(seen, right, zero) * 0.0625), vfloor(select(seen, bottom, zero) * 0.0625))
     vstore(spans, GROUP, x0)
     vstore(spans, 2 * GROUP, y0)
     vstore(spans, 3 * GROUP, x1)

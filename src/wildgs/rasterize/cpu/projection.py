@@ -1,7 +1,10 @@
-"""Projection on the CPU: torch tensors in and out, kernels inside, the gradient by hand."""
+"""Projection on the CPU: the autograd function around its kernels, tile lists, and reused working memory."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,16 +17,46 @@ from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.cpu import project_backward_kernels, project_kernels, tile_kernels
 from wildgs.rasterize.cpu.reach_kernels import RECORD, TILE
-from wildgs.rasterize.cpu.scratch import scratch
 from wildgs.rasterize.interface import Projection
 from wildgs.threads import begin, flat, launch, run_once, thread_count
+
+_lock = threading.Lock()
+_free: dict[str, np.ndarray] = {}
+
+
+@contextmanager
+def scratch(name: str, size: int, dtype: type) -> Iterator[np.ndarray]:
+    """A flat array with unknown content, kept under `name` afterwards.
+
+    Threads that ask at the same time get arrays of their own; the largest is the one kept.
+    """
+    with _lock:
+        array = _free.pop(name, None)
+    if array is None or array.size < size:
+        array = _aligned(size + size // 4, dtype)
+    try:
+        yield array[:size]
+    finally:
+        with _lock:
+            kept = _free.get(name)
+            if kept is None or kept.size < array.size:
+                _free[name] = array
+
+
+def _aligned(size: int, dtype: type) -> np.ndarray:
+    """A flat array that starts at a cache line."""
+    item = np.dtype(dtype).itemsize
+    raw = np.empty(size + 64 // item, dtype)
+    skip = -raw.ctypes.data % 64 // item
+    return raw[skip : skip + size]
+
 
 GROUP = project_kernels.GROUP
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """What blending needs to know of the geometry; arrays are flat.
+    """What blending reads of the geometry; arrays are flat.
 
     Gaussians that reach the picture are numbered by rank: neighbours in the picture are neighbours in memory.
 
@@ -34,7 +67,7 @@ class TileLists:
         starts: First slot of each rank's (tile, Gaussian) pairs, and the number of pairs.
         offsets: Where each tile's list starts in `entries` (pairs); one more than there are tiles.
         entries: Tile by tile, nearest first, two numbers: a rank, and the pair's slot among all ranks' pairs. They
-            lie together since they are written to places all over memory.
+            are adjacent because they are written in random order.
         tile_order: Tiles with long lists first, so that threads end together.
     """
 
@@ -87,14 +120,7 @@ class _Project(torch.autograd.Function):
     """Hands out what the projection kernel wrote; its backward pass is `project_backward`."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        lens: _Lens,
-        outputs: Any,
-    ) -> Any:
+    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, lens: _Lens, outputs: Any) -> Any:
         means2d, depths, conics, radii = outputs
         ctx.save_for_backward(means, quats, scales, radii)
         ctx.lens = lens
@@ -104,11 +130,7 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *grads: Any) -> Any:
         v_means2d, v_depths, v_conics = grads
         means, quats, scales, radii = ctx.saved_tensors
-        outputs = (
-            torch.empty_like(means),
-            torch.empty_like(quats),
-            torch.empty_like(scales),
-        )
+        outputs = (torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales))
         launch(
             project_backward_kernels.project_backward,
             *map(flat, (means, quats, scales)),
@@ -185,10 +207,7 @@ def _list_tiles(
     n = tile_counts.size
     seen = int(np.count_nonzero(tile_counts))
     ranks, homes = np.empty(n, np.int32), np.empty(seen, np.int32)
-    ranked_records, starts = (
-        np.empty(seen * RECORD, np.float32),
-        np.empty(seen + 1, np.int64),
-    )
+    ranked_records, starts = (np.empty(seen * RECORD, np.float32), np.empty(seen + 1, np.int64))
     offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
     chunks = max(1, min(2 * thread_count(), n // 1024))
     with (

@@ -38,16 +38,8 @@ def nearest_exponent(x0, y0, x1, y1, A, B, C, y_per_x, x_per_y):
 def reach(x, y, side, A, B, C, level, y_per_x, x_per_y):
     """Which squares of a 4 x 4 arrangement a Gaussian reaches, as 16 bits.
 
-    Args:
-        x: Centre of the arrangement's first pixel minus the Gaussian's, px.
-        y: Likewise.
-        side: Pixels along a square.
-        A: See `RECORD`, like all that follow.
-        B: -
-        C: -
-        level: -
-        y_per_x: -
-        x_per_y: -
+    (x, y) is the centre of the arrangement's first pixel minus the Gaussian's, `side` the length of a square, in
+    pixels; the other arguments are fields of a record, see `RECORD`.
     """
     x0 = lane_x() * side + x
     y0 = lane_y() * side + y

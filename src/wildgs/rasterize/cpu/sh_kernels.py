@@ -89,11 +89,7 @@ def shade_forward(counter, means, sh, bases, degree, eye, visible, out):
         for g in range(first, min(first + CHUNK, n)):
             red = green = blue = F(0.0)
             if visible[g]:
-                x, y, z = (
-                    means[3 * g] - eye[0],
-                    means[3 * g + 1] - eye[1],
-                    means[3 * g + 2] - eye[2],
-                )
+                x, y, z = (means[3 * g] - eye[0], means[3 * g + 1] - eye[1], means[3 * g + 2] - eye[2])
                 shrink = F(1.0) / max(math.sqrt(x * x + y * y + z * z), F(1e-12))
                 basis(degree, x * shrink, y * shrink, z * shrink, values)
                 red = green = blue = F(0.5)
@@ -131,11 +127,7 @@ def shade_backward(counter, means, sh, bases, degree, eye, visible, out, v_out, 
                 if v_means is not None:
                     v_means[3 * g] = v_means[3 * g + 1] = v_means[3 * g + 2] = 0.0
                 continue
-            x, y, z = (
-                means[3 * g] - eye[0],
-                means[3 * g + 1] - eye[1],
-                means[3 * g + 2] - eye[2],
-            )
+            x, y, z = (means[3 * g] - eye[0], means[3 * g + 1] - eye[1], means[3 * g + 2] - eye[2])
             shrink = F(1.0) / max(math.sqrt(x * x + y * y + z * z), F(1e-12))
             x, y, z = x * shrink, y * shrink, z * shrink
             basis(degree, x, y, z, values)

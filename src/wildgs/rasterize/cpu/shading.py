@@ -1,4 +1,4 @@
-"""Colours from spherical harmonics on the CPU: torch tensors in and out, kernels inside, the gradient by hand."""
+"""Colours from spherical harmonics on the CPU: the autograd function around its kernels."""
 
 from __future__ import annotations
 
@@ -19,12 +19,7 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        sh: Tensor,
-        eye: np.ndarray,
-        degree: int,
-        visible: np.ndarray,
+        ctx: Any, means: Tensor, sh: Tensor, eye: np.ndarray, degree: int, visible: np.ndarray
     ) -> Any:
         out = torch.empty(len(means), 3)
         launch(

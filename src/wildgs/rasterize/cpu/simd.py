@@ -98,12 +98,7 @@ _binary(operator.add, VECTOR, lambda b, x, y: b.fadd(x, y, flags=_FLAGS))
 _binary(operator.sub, VECTOR, lambda b, x, y: b.fsub(x, y, flags=_FLAGS))
 _binary(operator.mul, VECTOR, lambda b, x, y: b.fmul(x, y, flags=_FLAGS))
 _binary(operator.truediv, VECTOR, lambda b, x, y: b.fdiv(x, y, flags=_FLAGS))
-for _op, _sign in (
-    (operator.lt, "<"),
-    (operator.le, "<="),
-    (operator.gt, ">"),
-    (operator.ge, ">="),
-):
+for _op, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
     _binary(_op, MASK, lambda b, x, y, sign=_sign: b.fcmp_ordered(sign, x, y))
 
 

@@ -58,17 +58,7 @@ def place_chunks(cursors, offsets):
 
 @njit(nogil=True)
 def move_home(
-    counter,
-    tile_counts,
-    boxes,
-    masks,
-    records,
-    tiles_x,
-    cursors,
-    ranks,
-    homes,
-    ranked_records,
-    spans,
+    counter, tile_counts, boxes, masks, records, tiles_x, cursors, ranks, homes, ranked_records, spans
 ):
     """Gives Gaussians their ranks (-1: reaches no tile) and copies records, boxes, masks and counts there."""
     chunks, n = cursors.shape[0], tile_counts.size

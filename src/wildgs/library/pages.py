@@ -1,8 +1,9 @@
-"""The page that ends `wildgs demo` and `wildgs run`: a few views of a run, and their light exchanged."""
+"""The two pages of a run: the report (scores and comparisons), and the page that carries the scene."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,110 @@ import torch
 from torch import Tensor
 
 from wildgs.evaluation.metrics import to_8bit
-from wildgs.evaluation.photos import PhotoFit, find_misfits
+from wildgs.evaluation.photos import PhotoFit, find_misfits, read_photos
+from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
 from wildgs.exporters.report import MethodScores, Report, ReportExample, ReportMask, write_report
-from wildgs.geometry.tour import spread_out
+from wildgs.exporters.splats import CleanupConfig, Splats, kept_rows
+from wildgs.geometry.trajectory import spread_out
 from wildgs.library.evaluation import Scores
-from wildgs.library.loaded import LoadedScene
+from wildgs.library.loaded import LoadedScene, find_looks
+from wildgs.light.look import NEUTRAL, Look
 from wildgs.light.photos import encode_view
+from wildgs.model.gaussians import NEAR
 from wildgs.model.method import Method
+from wildgs.progress import Progress
 from wildgs.runs import Run
-from wildgs.scene import Scene, View
+from wildgs.scene import Scene, View, match_view
+
+PAGE_LIGHTS = 4
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A written file.
+
+    Attributes:
+        file: Where it was written.
+        megabytes: Its size.
+        num_gaussians: Gaussians in it.
+        sh_degree: Degree of its spherical harmonics.
+        looks: The appearances that it holds: one, or all of the page's.
+    """
+
+    file: Path
+    megabytes: float
+    num_gaussians: int
+    sh_degree: int
+    looks: tuple[Look, ...]
+
+
+@torch.no_grad()
+def write_webpage(
+    loaded: LoadedScene,
+    looks: Sequence[Look],
+    file: Path,
+    *,
+    title: str,
+    cleanup: CleanupConfig | None = None,
+) -> ExportedFile:
+    """Writes the page of a run under some looks, the first of which it opens with; `cleanup` drops Gaussians."""
+    cleanup = cleanup or CleanupConfig()
+    scene = loaded.scene
+    views = scene.train_views or scene.views
+    number, depth = choose_start([view.camera for view in views], scene.points)
+    splats = baked(loaded, looks[0])
+    keep = kept_rows(cleanup, splats, scene.points)
+    lights = [
+        PageLight(look.name, look.sh.cpu().detach()[keep], _thumbnail(loaded, look, views[number]))
+        for look in looks
+    ]
+    page = Page(
+        title=title,
+        summary=f"{int(keep.sum()):,} Gaussians from {len(scene.views)} photos, by Wild-GS.",
+        splats=splats.select(keep),
+        lights=lights,
+        start=PageView(views[number].camera, depth),
+        near=NEAR,
+    )
+    degree = write_page(page, file, viewpoints=viewpoints_of(scene.views), sh_degree=cleanup.sh_degree)
+    return ExportedFile(file, file.stat().st_size / 1e6, len(page.splats), degree, tuple(looks))
+
+
+def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> ExportedFile:
+    """Writes the page of a run under lights chosen for it; ends `wildgs run` and `wildgs demo`."""
+    loaded = LoadedScene(run)
+    return write_webpage(loaded, page_looks(loaded, progress), file, title=title)
+
+
+def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Look]:
+    """The light of a few photos as unlike each other as the scene has them; the one look of plain 3DGS."""
+    if not loaded.relightable:
+        return [loaded.appearance(NEUTRAL)]
+    views = loaded.scene.train_views or loaded.views
+    misfits = find_misfits(read_photos(loaded.run.folder, loaded.run.step) or [])
+    chosen = different_lights(_without(views, misfits), PAGE_LIGHTS)
+    return find_looks(loaded, [view.name for view in chosen], progress=progress)
+
+
+def baked(loaded: LoadedScene, look: Look) -> Splats:
+    """The run's Gaussians under a look, in main memory, in the scene's aligned frame."""
+    gaussians = loaded.gaussians
+    values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, look.sh)
+    return Splats(*(value.detach().cpu().float() for value in values))
+
+
+def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
+    """Camera centres, evenly chosen where there are many."""
+    chosen = views[:: max(1, -(-len(views) // 64))]
+    return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
+
+
+def _thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
+    """The photo whose light it is; where it is none of the scene's, the first view under that light."""
+    view = match_view(loaded.views, look.name)
+    pixels = loaded.render(start.camera, look) if view is None else view.read_photo()
+    return pixels.numpy()
+
 
 EXAMPLES = 4
 LIGHTS = 3
@@ -33,14 +129,14 @@ def write_showcase(
     scene: Scene,
     runs: Sequence[tuple[str, Run, Scores]],
 ) -> None:
-    """Writes the page.
+    """Writes the report of some runs of one scene.
 
     Args:
         file: The HTML file.
         title: Its headline.
         summary: A paragraph below it.
         scene: The scene of all runs.
-        runs: Name, run and scores; the first is shown in pictures, the second is its baseline.
+        runs: Name, run and scores; pictures show the first, and the second as its baseline.
     """
     shown = runs[0][1].method
     baseline = runs[1][1].method if len(runs) > 1 else None
@@ -48,7 +144,7 @@ def write_showcase(
     chosen = views[:: max(1, -(-len(views) // EXAMPLES))][:EXAMPLES]
     fits = LoadedScene(runs[0][1]).photo_fits(scene=scene)
     misfits = find_misfits(fits)
-    lights = different_lights(without(scene.train_views, misfits), LIGHTS + 1)
+    lights = different_lights(_without(scene.train_views, misfits), LIGHTS + 1)
     with torch.no_grad():
         examples = tuple(_example(view, lights, shown, baseline) for view in chosen)
     methods = tuple(MethodScores.from_metrics(name, {**scores}) for name, _, scores in runs if scores)
@@ -87,7 +183,7 @@ def _beside_masks(method: Method, scene: Scene, fits: Sequence[PhotoFit]) -> tup
     return tuple(found)
 
 
-def without(views: Sequence[View], misfits: Sequence[PhotoFit]) -> list[View]:
+def _without(views: Sequence[View], misfits: Sequence[PhotoFit]) -> list[View]:
     """Views but those of photos that fit no light: their appearance is that of a drawing or a collage."""
     names = {photo.name for photo in misfits}
     return [view for view in views if view.name not in names]

@@ -1,7 +1,0 @@
-"""The CPU backend's three verbs."""
-
-from wildgs.rasterize.cpu.blending import blend
-from wildgs.rasterize.cpu.projection import project
-from wildgs.rasterize.cpu.shading import sh_to_colors
-
-__all__ = ["blend", "project", "sh_to_colors"]

@@ -1,0 +1,62 @@
+"""The colour match within the method: in training, in encoding, and for checkpoints that have no light codes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from wildgs.model.method import Stage
+from wildgs.model.photo_match import PhotoMatch
+from wildgs.model.registry import restore_method
+
+
+def grey_photo(camera, value: float) -> torch.Tensor:
+    return torch.full((camera.height, camera.width, 3), value)
+
+
+def test_a_training_render_has_the_exposure_of_its_photo(camera, make_wall_model) -> None:
+    model = make_wall_model()
+    for value in (0.2, 0.8):
+        rendering = model.training_pass(grey_photo(camera, value), camera, Stage()).rendering
+        inner = rendering.colors[8:-8, 8:-8]
+        torch.testing.assert_close(inner, torch.full_like(inner, value), atol=0.04, rtol=0)
+    model.photo_match.config = replace(model.config, matched_loss=0.0)
+    rendering = model.training_pass(grey_photo(camera, 0.2), camera, Stage()).rendering
+    assert float(rendering.colors.detach().mean()) > 0.3, (
+        "a wall of grey 0.5 under a light that nothing has learnt"
+    )
+
+
+def test_the_match_takes_no_gradient_and_the_codes_do(camera, make_wall_model) -> None:
+    model = make_wall_model()
+    x = torch.linspace(0.2, 0.8, camera.width)[None, :, None]
+    photo = x.expand(camera.height, -1, 3).contiguous()
+    output = model.training_pass(photo, camera, Stage())
+    (output.rendering.colors - photo).square().mean().backward()
+    assert model.photo_match.codes.weight.grad.abs().sum() > 0
+    assert output.rendering.colors.shape == photo.shape
+
+
+def test_a_colour_map_has_columns_for_the_codes(camera, make_wall_model) -> None:
+    model = make_wall_model()
+    assert model.map_columns == 4 + model.config.light_codes
+    assert model.encode(grey_photo(camera, 0.3), camera).color_map.shape == (3, model.map_columns)
+
+
+def test_checkpoints_without_codes_are_read(camera, make_wall_model) -> None:
+    model = make_wall_model()
+    state = {name: value for name, value in model.state_dict().items() if not name.startswith("photo_match.")}
+    back = restore_method("wildgs", model.config, state)
+    assert back.map_columns == 4
+    photo = grey_photo(camera, 0.3)
+    with torch.no_grad():
+        rendered = back.render(camera, back.shade(back.encode(photo, camera))).colors[8:-8, 8:-8]
+    torch.testing.assert_close(rendered, photo[8:-8, 8:-8], atol=0.05, rtol=0)
+
+
+@pytest.mark.parametrize("without", [("intrinsic",), ()])
+def test_codes_need_intrinsic_features(without, make_wall_model) -> None:
+    config = replace(make_wall_model().config, without=without)
+    assert (PhotoMatch(config).codes is None) == bool(without)
