@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from wildgs.exporters.depth_colors import color_depth
-from wildgs.exporters.report import MethodScores, Report, ReportExample, write_report
+from wildgs.exporters.report import MethodScores, Report, ReportExample, ReportMask, write_report
 
 HOSTILE = """<script>alert("x")</script>'"&.jpg"""
 REASON = "LPIPS is null: its weights are not at hand"
@@ -107,6 +107,25 @@ def test_every_picture_is_inside_the_page_with_its_own_pixels_and_says_what_it_s
         np.testing.assert_allclose(by_color[alt], color, atol=4)
     assert len(pictures) == 8
     assert max(pictures[-1][1].size) == 160, "a source photo is shown small"
+
+
+def test_training_photos_stand_beside_their_masks(tmp_path: Path) -> None:
+    visibility = np.ones((300, 600), dtype=np.float32)
+    visibility[:, :300] = 0
+    masks = (ReportMask("b.jpg", _flat(300, 600, (200, 200, 200)), visibility, "3.0% hidden"),)
+    misfits = (ReportMask(HOSTILE, _flat(30, 20, (9, 9, 200)), None, "5.0 dB"),)
+    file = tmp_path / "report.html"
+    write_report(Report("A title", "A summary", misfits=misfits, masks=masks), file)
+    page = Page(file)
+    pictures = {str(attributes["alt"]): np.asarray(image) for attributes, image in page.pictures()}
+    hidden = pictures["What the mask of b.jpg hides"]
+    assert hidden.shape == (120, 240, 3), "shown small"
+    assert hidden[60, 30, 0] > 150 > 100 > hidden[60, 30, 1]
+    np.testing.assert_allclose(hidden[60, 210], 200, atol=4)
+    np.testing.assert_allclose(pictures[f"Training photo {HOSTILE}"][5, 5], (9, 9, 200), atol=8)
+    assert len(pictures) == 3
+    assert page.text.index("Photos that fit no light") < page.text.index("Masks of training photos")
+    assert not page.open
 
 
 def test_nothing_is_loaded_from_elsewhere(tmp_path: Path) -> None:

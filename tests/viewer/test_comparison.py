@@ -6,7 +6,8 @@ import numpy as np
 
 from tests.memory_views import make_view
 from wildgs.engine.trainer import Trainer
-from wildgs.viewer.photos import HIDDEN_TINT, LONG_SIDE, compare, tint_hidden
+from wildgs.exporters.depth_colors import HIDDEN_TINT, tint_hidden
+from wildgs.viewer.photos import LONG_SIDE, compare
 from wildgs.viewer.subject import Subject
 
 

@@ -73,6 +73,56 @@ def test_thumbnails_come_with_a_frustum_each(viewer: Viewer, wall: Scene) -> Non
     assert viewer.lighting._sheet.content.count("<img") == len(wall.views)
 
 
+def test_masks_are_shown_over_photos_until_they_are_switched_off(
+    viewer: Viewer, subject: Subject, wall: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def left_is_hidden(view) -> torch.Tensor:
+        return (torch.arange(32) >= 16).float().expand(32, 32)
+
+    monkeypatch.setattr(subject, "visibility", left_is_hidden)
+    plain = dict(viewer.gallery.sources())
+    names = [view.name for view in wall.views]
+    viewer.lighting.masks.value = True
+    viewer._masks_asked(True)
+    work_off(viewer)
+    assert all(source != plain[name] for name, source in viewer.gallery.sources())
+    tinted = viewer.gallery.picture(names[0])
+    assert tinted is not None
+    assert tinted[16, 4, 0] > 150 > 80 > tinted[16, 4, 1]
+    assert np.ptp(tinted[16, 28]) == 0, "grey where nothing is hidden"
+    assert np.array_equal(viewer.photos._frustums[names[0]].image, tinted)
+    assert len(viewer.photos._frustums) == len(names), "no frustum twice"
+    assert dict(viewer.gallery.sources())[names[0]] in viewer.lighting._sheet.content
+    viewer._masks_asked(False)
+    assert dict(viewer.gallery.sources()) == plain
+    assert plain[names[0]] in viewer.lighting._sheet.content
+
+
+def test_masks_follow_a_training(viewer: Viewer, subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subject, "visibility", lambda view: torch.ones(32, 32))
+    viewer._masks_asked(True)
+    work_off(viewer)
+    before = viewer.gallery.sources()
+    monkeypatch.setattr(subject, "visibility", lambda view: torch.zeros(32, 32))
+    viewer.ask_for_update()
+    work_off(viewer)
+    assert all(old != new for old, new in zip(before, viewer.gallery.sources(), strict=True))
+
+
+def test_a_method_without_masks_says_so(
+    viewer: Viewer, subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    complaints: list[str] = []
+    monkeypatch.setattr(subject, "visibility", lambda view: None)
+    monkeypatch.setattr(viewer, "complain", complaints.append)
+    viewer.lighting.masks.value = True
+    viewer._masks_asked(True)
+    work_off(viewer)
+    assert complaints == ["this method predicts no masks"]
+    assert not viewer.lighting.masks.value
+    assert not viewer.gallery.masks
+
+
 def test_begins_between_two_lights_that_differ(viewer: Viewer) -> None:
     desk = viewer.lighting.desk
     assert "dark" in desk.first.label

@@ -1,4 +1,4 @@
-"""Colour maps for depth."""
+"""Colours for depth and for masks over photos."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ _INFERNO = np.array(
     dtype=float,
 )
 _NO_DEPTH = (128, 128, 128)
+HIDDEN_TINT = np.array([230.0, 40.0, 40.0])
 
 
 def color_depth(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
@@ -37,3 +38,12 @@ def color_depth(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
     channels = [np.interp(share, stops, _INFERNO[:, c]) for c in range(3)]
     picture[known] = np.stack(channels, axis=-1).round().astype(np.uint8)
     return picture
+
+
+def tint_hidden(
+    photo: UInt8[np.ndarray, "H W 3"], visibility: Float[np.ndarray, "H W"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The photo, greyed, with red where visibility M is low."""
+    grey = photo.mean(axis=2, keepdims=True).repeat(3, axis=2)
+    hidden = (1 - np.clip(visibility, 0, 1))[..., None]
+    return ((1 - 0.8 * hidden) * grey + 0.8 * hidden * HIDDEN_TINT).round().astype(np.uint8)

@@ -15,15 +15,17 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from wildgs.exporters.depth_colors import color_depth
+from wildgs.exporters.depth_colors import color_depth, tint_hidden
 from wildgs.exporters.report_scores import MethodScores, scores_section
 from wildgs.files import printable, written_aside
 
-__all__ = ["MethodScores", "Report", "ReportExample", "write_report"]
+__all__ = ["MethodScores", "Report", "ReportExample", "ReportMask", "write_report"]
 
 Photo = UInt8[np.ndarray, "H W 3"]
 
 _QUALITY = 88
+MASK_SIDE = 240
+"""Longer side, in pixels, of a training photo beside its mask."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,23 @@ class ReportExample:
 
 
 @dataclass(frozen=True)
+class ReportMask:
+    """A training photo and what its mask hides.
+
+    Attributes:
+        name: Name of the photo.
+        photo: The photo.
+        visibility: Mask M, 1 = static; None for a method without masks.
+        caption: What was measured of it.
+    """
+
+    name: str
+    photo: UInt8[np.ndarray, "H W 3"]
+    visibility: Float[np.ndarray, "H W"] | None
+    caption: str
+
+
+@dataclass(frozen=True)
 class Report:
     """Content of a report.
 
@@ -62,12 +81,16 @@ class Report:
         summary: Paragraph below the headline.
         methods: Rows of the table of scores.
         examples: Views, from top to bottom.
+        misfits: Training photos that fit no light, worst first.
+        masks: Other training photos and their masks, worst first.
     """
 
     title: str
     summary: str
     methods: tuple[MethodScores, ...] = ()
     examples: tuple[ReportExample, ...] = ()
+    misfits: tuple[ReportMask, ...] = ()
+    masks: tuple[ReportMask, ...] = ()
 
 
 def escape(text: str) -> str:
@@ -87,7 +110,7 @@ def write_report(report: Report, file: Path) -> None:
         title=escape(report.title),
         summary=escape(report.summary),
         scores=scores_section(report.methods),
-        examples=_examples(report.examples),
+        examples=_examples(report.examples) + _misfits(report.misfits) + _masks(report.masks),
         footer="Written by Wild-GS. All pictures are embedded; nothing is loaded from the network.",
     )
     with written_aside(file) as aside:
@@ -102,6 +125,42 @@ def _examples(examples: Sequence[ReportExample]) -> str:
         "In the mask, white is predicted to be static and black transient (passers-by). In the depth map, "
         "bright is near.</p>" + "".join(map(_example, examples)) + "</section>"
     )
+
+
+def _misfits(photos: Sequence[ReportMask]) -> str:
+    hint = (
+        "Their renders resemble them under no light, not even their own: collages, drawings, other places, wrong "
+        "poses, or parts of the scene that are not learnt. Training without them may be better. "
+    )
+    return _beside_masks("Photos that fit no light", hint, photos)
+
+
+def _masks(photos: Sequence[ReportMask]) -> str:
+    hint = (
+        "Static observations are points of the landmark that three photos or more agree on; a mask that hides them "
+        "is wrong. Photos that lose most of them come first. "
+    )
+    return _beside_masks("Masks of training photos", hint, photos)
+
+
+def _beside_masks(title: str, hint: str, photos: Sequence[ReportMask]) -> str:
+    if not photos:
+        return ""
+    red = "Red is hidden by the mask (M is low)." if photos[0].visibility is not None else ""
+    figures = "".join(map(_beside_mask, photos))
+    return f'<section><h2>{title}</h2><p class="hint">{hint}{red}</p><div class="masks">{figures}</div></section>'
+
+
+def _beside_mask(photo: ReportMask) -> str:
+    name, picture = escape(photo.name), Image.fromarray(photo.photo)
+    picture.thumbnail((MASK_SIDE, MASK_SIDE), Image.Resampling.LANCZOS)
+    small = np.asarray(picture)
+    pictures = _picture(small, f"Training photo {name}")
+    if photo.visibility is not None:
+        mask = Image.fromarray(photo.visibility.astype(np.float32)).resize(picture.size, Image.Resampling.BOX)
+        pictures += _picture(tint_hidden(small, np.asarray(mask)), f"What the mask of {name} hides")
+    caption = f"<figcaption><b>{name}</b>: {escape(photo.caption)}</figcaption>"
+    return f'<figure><div class="beside">{pictures}</div>{caption}</figure>'
 
 
 def _example(example: ReportExample) -> str:

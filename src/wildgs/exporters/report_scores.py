@@ -52,6 +52,7 @@ class MethodScores:
         """
         any_file: Mapping[str, Any] = next(iter(metrics.values()), {})
         notes = [note for content in metrics.values() for note in _as_lines(content.get("notes"))]
+        notes += _hidden_note(metrics.get("full", {}))
         return cls(
             name=name,
             scores={
@@ -65,6 +66,16 @@ class MethodScores:
             device=str(any_file.get("device") or ""),
             notes=tuple(dict.fromkeys(notes)),
         )
+
+
+def _hidden_note(metrics: Mapping[str, Any]) -> list[str]:
+    """How much of what is proven static the masks hide, where that is known."""
+    hidden, worst = metrics.get("static_hidden"), metrics.get("static_hidden_worst")
+    if hidden is None or worst is None:
+        return []
+    return [
+        f"masks hide {hidden:.2%} of the static observations in training photos ({worst:.1%} in the worst photo)"
+    ]
 
 
 def scores_section(methods: Sequence[MethodScores]) -> str:

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from wildgs.evaluation.metrics import to_8bit
+from wildgs.evaluation.photos import PhotoFit, find_misfits, read_photos
 from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
-from wildgs.exporters.report import MethodScores, Report, ReportExample, write_report
+from wildgs.exporters.report import MethodScores, Report, ReportExample, ReportMask, write_report
 from wildgs.exporters.splats import CleanupConfig, Splats, kept_rows
 from wildgs.geometry.trajectory import spread_out
 from wildgs.library.evaluation import Scores
@@ -90,7 +91,8 @@ def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Lo
     if not loaded.relightable:
         return [loaded.appearance(NEUTRAL)]
     views = loaded.scene.train_views or loaded.views
-    chosen = different_lights(views, PAGE_LIGHTS)
+    misfits = find_misfits(read_photos(loaded.run.folder, loaded.run.step) or [])
+    chosen = different_lights(_without(views, misfits), PAGE_LIGHTS)
     return find_looks(loaded, [view.name for view in chosen], progress=progress)
 
 
@@ -116,6 +118,8 @@ def _thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
 
 EXAMPLES = 4
 LIGHTS = 3
+MISFITS, MASKS = 12, 24
+"""Photos in the report's sections, at most."""
 
 
 def write_showcase(
@@ -138,11 +142,51 @@ def write_showcase(
     baseline = runs[1][1].method if len(runs) > 1 else None
     views = scene.test_views or scene.train_views
     chosen = views[:: max(1, -(-len(views) // EXAMPLES))][:EXAMPLES]
-    lights = different_lights(scene.train_views, LIGHTS + 1)
+    fits = LoadedScene(runs[0][1]).photo_fits(scene=scene)
+    misfits = find_misfits(fits)
+    lights = different_lights(_without(scene.train_views, misfits), LIGHTS + 1)
     with torch.no_grad():
         examples = tuple(_example(view, lights, shown, baseline) for view in chosen)
     methods = tuple(MethodScores.from_metrics(name, {**scores}) for name, _, scores in runs if scores)
-    write_report(Report(title, summary, methods, examples), file)
+    others = [fit for fit in fits if fit.hidden is not None and fit not in misfits]
+    others.sort(key=lambda fit: (fit.static_hidden or 0.0, fit.hidden or 0.0), reverse=True)
+    report = Report(
+        title,
+        summary,
+        methods,
+        examples,
+        misfits=_beside_masks(shown, scene, misfits[:MISFITS]),
+        masks=_beside_masks(shown, scene, others[:MASKS]),
+    )
+    write_report(report, file)
+
+
+@torch.no_grad()
+def _beside_masks(method: Method, scene: Scene, fits: Sequence[PhotoFit]) -> tuple[ReportMask, ...]:
+    """Training photos with their masks, and what was measured of them."""
+    views = {view.name: view for view in scene.train_views}
+    device, found = method.gaussians.means.device, []
+    for fit in fits:
+        if fit.name not in views:
+            continue
+        visibility = method.visibility(views[fit.name].load(device)[0])
+        mask = None if visibility is None else visibility.float().cpu().numpy()
+        caption = [
+            "nothing to compare" if fit.psnr is None else f"{fit.psnr:.1f} dB, structure {fit.structure:.2f}"
+        ]
+        if fit.static_hidden is not None:
+            caption.append(f"{fit.static_hidden:.1%} of {fit.observations} static observations hidden")
+        if fit.hidden is not None:
+            caption.append(f"{fit.hidden:.0%} of the photo hidden")
+        photo = views[fit.name].read_photo().numpy()
+        found.append(ReportMask(fit.name, photo, mask, "; ".join(caption)))
+    return tuple(found)
+
+
+def _without(views: Sequence[View], misfits: Sequence[PhotoFit]) -> list[View]:
+    """Views but those of photos that fit no light: their appearance is that of a drawing or a collage."""
+    names = {photo.name for photo in misfits}
+    return [view for view in views if view.name not in names]
 
 
 def different_lights(views: Sequence[View], count: int) -> list[View]:

@@ -90,6 +90,7 @@ class LightPanel:
         gallery: Gallery,
         changed: Callable[[], None],
         lender: Callable[[], str],
+        masks_asked: Callable[[bool], None],
     ) -> None:
         """Adds the controls to the open container.
 
@@ -99,6 +100,7 @@ class LightPanel:
             gallery: Photos to choose from.
             changed: Called on a thread of viser after the desk changed.
             lender: Names the photo whose camera a picture borrows.
+            masks_asked: Called, likewise, when masks over the photos are switched on or off.
         """
         self.desk = desk
         self._server, self._gallery = server, gallery
@@ -112,6 +114,10 @@ class LightPanel:
         )
         self._sheet = gui.add_html("")
         self._buttons = {name: self._add_button(name) for name in gallery.names}
+        self.masks = gui.add_checkbox(
+            "Masks over photos", gallery.masks, hint="Red is what the mask of a photo hides, as passers-by"
+        )
+        self.masks.on_update(lambda _: masks_asked(self.masks.value))
         self._slider = gui.add_slider("Mix", 0.0, 1.0, 0.01, desk.amount)
         self._frames = gui.add_html("")
         self._pair = gui.add_html("")

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.evaluation.metrics import psnr
-from wildgs.exporters.depth_colors import color_depth
+from wildgs.exporters.depth_colors import color_depth, tint_hidden
 from wildgs.files import printable
 from wildgs.light.look import Look
 from wildgs.scene import View
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 LONG_SIDE = 480
 """Long side of the pictures, pixels."""
 
-HIDDEN_TINT = np.array([230.0, 40.0, 40.0])
 Picture = UInt8[np.ndarray, "H W 3"]
 
 
@@ -78,13 +77,6 @@ def compare(subject: Subject, view: View, look: Look) -> Comparison:
     )
 
 
-def tint_hidden(photo: Picture, visibility: Float[np.ndarray, "H W"]) -> Picture:
-    """The photo, greyed, with red where visibility is low."""
-    grey = photo.mean(axis=2, keepdims=True).repeat(3, axis=2)
-    hidden = (1 - np.clip(visibility, 0, 1))[..., None]
-    return ((1 - 0.8 * hidden) * grey + 0.8 * hidden * HIDDEN_TINT).round().astype(np.uint8)
-
-
 def _resized(channels: Float[Tensor, "C H W"], width: int, height: int) -> Float[Tensor, "C h w"]:
     options = {"mode": "bilinear", "antialias": True}
     return torch.nn.functional.interpolate(channels[None], (height, width), **options)[0]
@@ -120,6 +112,7 @@ class PhotoPanel:
         self._by_label = {printable(view.name): view for view in views}
         self.current: View | None = None
         self._frustums: dict[str, viser.CameraFrustumHandle] = {}
+        self._shown: dict[str, np.ndarray] = {}
         gui = server.gui
         # Not shown at first: at a photo's viewpoint, the photos of others stand in the way.
         self.parent = server.scene.add_frame(PARENT, show_axes=False, visible=False)
@@ -143,10 +136,14 @@ class PhotoPanel:
         self.refresh()
 
     def refresh(self) -> None:
-        """Adds frustums for the photos whose thumbnails are there."""
+        """Adds frustums for the photos whose thumbnails are there, and shows those that changed."""
         for view in self._gallery.views:
             picture = self._gallery.picture(view.name)
-            if picture is None or view.name in self._frustums:
+            if picture is None or picture is self._shown.get(view.name):
+                continue
+            self._shown[view.name] = picture
+            if view.name in self._frustums:
+                self._frustums[view.name].image = picture
                 continue
             pose = pose_of(view.camera)
             frustum = self._server.scene.add_camera_frustum(

@@ -96,6 +96,7 @@ class Viewer:
                 self.gallery,
                 self._light_changed,
                 self._nearest_photo,
+                self._masks_asked,
             )
             self.lighting.touched = bool(lights)
         with tabs.add_tab("Photos"):
@@ -155,9 +156,16 @@ class Viewer:
     def _film_ordered(self, client: viser.ClientHandle | None) -> None:
         self._ask("film", lambda: self._film(client))
 
+    def _masks_asked(self, shown: bool) -> None:
+        self.gallery.show_masks(shown)
+        if shown:
+            self._ask("masks", self._mask_thumbnails)
+
     def ask_for_update(self) -> None:
         """Queues an update of the Gaussians, the light and the comparison to the subject's present state."""
         self._ask("light", self._relight)
+        if self.gallery.masks:
+            self._masks_asked(True)
         if self.photos.current is not None:
             self._ask("compare", self._compare)
 
@@ -233,6 +241,15 @@ class Viewer:
         elif self.subject.relightable and (colors := self.gallery.mean_colors()):
             first = next(iter(colors))
             self.lighting.suggest(first, most_different(colors, first))
+
+    def _mask_thumbnails(self) -> None:
+        try:
+            more = self.gallery.mask_some(self.subject.visibility)
+        except UserError:
+            self.lighting.masks.value = False
+            raise
+        if more:
+            self._ask("masks", self._mask_thumbnails)
 
     def close(self) -> None:
         """Stops the queue and the server."""
