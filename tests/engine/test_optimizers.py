@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.engine import optimizers as optimizers_module
-from wildgs.engine.optimizers import OptimizerConfig, Optimizers, edit_rows, reset_moments
+from wildgs.engine.optimizers import (
+    OptimizerConfig,
+    Optimizers,
+    edit_rows,
+    geometry_rates,
+    reset_moments,
+)
 from wildgs.model.vanilla import VanillaConfig, VanillaGS
 
 
@@ -110,3 +116,14 @@ def test_state_goes_round() -> None:
     fresh.restore(optimizers.state())
     for name in method.gaussians.rows:
         assert torch.equal(moments(method, fresh, name), moments(method, optimizers, name))
+
+
+def test_short_runs_move_the_geometry_faster() -> None:
+    config = OptimizerConfig(short_runs=0.5)
+    long, short, longer = (geometry_rates(config, 2.0, steps) for steps in (30_000, 300, 60_000))
+    for row in ("means", "quats", "log_scales"):
+        assert short[row].start == pytest.approx(10 * long[row].start)
+        assert short[row].decay == long[row].decay
+    assert short["opacity_logits"] == long["opacity_logits"]
+    assert longer == long
+    assert long["means"].start == 2.0 * config.means

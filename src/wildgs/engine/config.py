@@ -53,6 +53,8 @@ class OptimizerConfig:
         scales: Logarithms of the scales.
         quats: Orientations.
         opacities: Opacity logits.
+        short_runs: Rates of positions, scales and orientations are multiplied by (30,000 / steps) to this power in
+            runs of fewer than 30,000 steps, for which 3DGS's were chosen. Not in 3DGS.
         batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
             rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
     """
@@ -62,6 +64,7 @@ class OptimizerConfig:
     scales: float = 5e-3
     quats: float = 1e-3
     opacities: float = 5e-2
+    short_runs: float = 0.25
     batch_scaling: Literal["sqrt", "none"] = "sqrt"
 
 

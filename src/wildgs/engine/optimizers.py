@@ -11,19 +11,26 @@ from torch import Tensor, nn
 
 from wildgs import features
 from wildgs.engine.config import OptimizerConfig
-from wildgs.engine.schedule import exponential
+from wildgs.engine.schedule import REFERENCE_STEPS, exponential
 from wildgs.geometry.morton import morton_order
 from wildgs.model.config import LearningRate
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
 
 
-def geometry_rates(config: OptimizerConfig, extent: float) -> dict[str, LearningRate]:
-    """Learning rates of the rows that every method has; `extent` scales positions."""
+def geometry_rates(config: OptimizerConfig, extent: float, steps: int) -> dict[str, LearningRate]:
+    """Learning rates of the rows that every method has.
+
+    Args:
+        config: The rates.
+        extent: Scales positions.
+        steps: Length of the run.
+    """
+    factor = max(1.0, REFERENCE_STEPS / steps) ** config.short_runs
     return {
-        "means": LearningRate(config.means * extent, config.means_final / config.means),
-        "quats": LearningRate(config.quats),
-        "log_scales": LearningRate(config.scales),
+        "means": LearningRate(factor * config.means * extent, config.means_final / config.means),
+        "quats": LearningRate(factor * config.quats),
+        "log_scales": LearningRate(factor * config.scales),
         "opacity_logits": LearningRate(config.opacities),
     }
 
@@ -49,7 +56,14 @@ class Optimizers:
     photos: int = 1
 
     @classmethod
-    def build(cls, method: Method, config: OptimizerConfig, extent: float, photos: int = 1) -> Optimizers:
+    def build(
+        cls,
+        method: Method,
+        config: OptimizerConfig,
+        extent: float,
+        photos: int = 1,
+        steps: int = REFERENCE_STEPS,
+    ) -> Optimizers:
         """Optimisers for a method.
 
         Args:
@@ -57,10 +71,11 @@ class Optimizers:
             config: Learning rates of the geometry.
             extent: Radius of the cameras' region, world units (3DGS's spatial learning rate scale).
             photos: Photos in the mean gradient of one step.
+            steps: Length of the run.
         """
         scaled = photos if config.batch_scaling == "sqrt" else 1
         rate, betas = scaled**0.5, (0.9**scaled, 0.999**scaled)
-        row_rates = geometry_rates(config, extent) | method.row_rates()
+        row_rates = geometry_rates(config, extent, steps) | method.row_rates()
         groups = [
             {"params": [parameter], "name": name, "lr": rate * row_rates[name].start}
             for name, parameter in method.gaussians.rows.items()

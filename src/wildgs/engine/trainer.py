@@ -118,7 +118,7 @@ class Trainer:
         self.schedule = Schedule(config.schedule, config.steps)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
-        self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size)
+        self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size, config.steps)
         self.density = DensityControl(config.density, extent, len(method.gaussians), self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)

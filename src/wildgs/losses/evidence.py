@@ -17,7 +17,7 @@ or that are a pixel off, average out; people do not."""
 BRIGHTNESS_SHARE = 0.25
 """Of a difference in brightness against one in colour, squared: light and shadow change the one, people also the
 other."""
-HALF_EVIDENCE = 0.15
+HALF_EVIDENCE = 0.11
 """Difference of colours at which evidence reaches half of its limit."""
 MOST_EVIDENCE = 0.8
 """Limit of the evidence, in units of the image loss: twice λ^M's start, so that what is surely in the way is hidden

@@ -246,7 +246,7 @@ class WildGSConfig:
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
     matched_loss: float = 1.0
-    light_codes: int = 3
+    light_codes: int = 8
     light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
