@@ -245,7 +245,7 @@ class WildGSConfig:
     ground: GroundConfig = field(default_factory=GroundConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
-    matched_loss: float = 1.0
+    matched_loss: float = 0.8
     light_codes: int = 8
     light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
