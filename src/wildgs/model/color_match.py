@@ -162,6 +162,20 @@ def changed_picture(
     return torch.where(sky.which[..., None], above, below)
 
 
+def composed(first: Float[Tensor, "3 M"], second: Float[Tensor, "3 M"], codes: int) -> Float[Tensor, "3 M"]:
+    """The change that does what one does and then the other.
+
+    Args:
+        first: From `match_photo`.
+        second: From `match_photo`, of the render that the first one changed.
+        codes: Number of light codes.
+    """
+    columns = (4 + codes, first.shape[1] - 4 - codes)
+    blocks = zip(first.split(columns, dim=1), second.split(columns, dim=1), strict=True)
+    parts = [one + other + other[:, :3] @ one for one, other in blocks if one.shape[1]]
+    return torch.cat(parts, dim=1)
+
+
 def _split(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
     """[A | b] of the landmark and what its codes change, the same of the sky and its elevation."""
     return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)

@@ -37,10 +37,14 @@ class PhotoMatch(nn.Module):
             self.codes = nn.Linear(config.fusion.intrinsic_size, config.light_codes, bias=False)
 
     @property
+    def num_codes(self) -> int:
+        """Light codes of a Gaussian."""
+        return 0 if self.codes is None else self.codes.out_features
+
+    @property
     def columns(self) -> int:
         """Columns of a change: [A | b] and the light codes' of the landmark, and the sky's."""
-        codes = 0 if self.codes is None else self.codes.out_features
-        return 4 + codes + (SKY_COLUMNS if self.config.sky.points else 0)
+        return 4 + self.num_codes + (SKY_COLUMNS if self.config.sky.points else 0)
 
     def light_codes(self, intrinsic: Float[Tensor, "N I"]) -> Float[Tensor, "N L"]:
         """What the change of colours may depend on, from Gaussian to Gaussian."""

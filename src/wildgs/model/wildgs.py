@@ -12,6 +12,7 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.color_match import composed
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
@@ -25,6 +26,9 @@ from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, Trainin
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
 from wildgs.rasterize import Projection, blend
+
+MATCHES = 3
+"""Colour matches of a photo that is encoded, one after the other."""
 
 
 class WildGS(Method):
@@ -173,13 +177,27 @@ class WildGS(Method):
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
         if not (self.config.color_match and trust_mask):
             return appearance
+        # Colours below black are rendered as black: what the first match lifts above it, the second one sees.
+        for _ in range(MATCHES):
+            appearance = replace(appearance, color_map=self._match(photo, appearance, projection, keep))
+        return self.light_basis.fit(self, photo, appearance, camera, keep)
+
+    @torch.no_grad()
+    def _match(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        appearance: Appearance,
+        projection: Projection,
+        keep: Bool[Tensor, "H W"] | None,
+    ) -> Float[Tensor, "3 M"]:
+        """An appearance's colour map, and after it what its own render of the photo is still off by."""
+        colors = self.paint(projection, appearance, self.sh_degree)
         intrinsic = self.gaussians.rows["intrinsic"]
-        with torch.no_grad():
-            colors = self.paint(projection, appearance, self.sh_degree)
-            change = self.photo_match.find(
-                photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
-            )
-        return self.light_basis.fit(self, photo, replace(appearance, color_map=change), camera, keep)
+        change = self.photo_match.find(
+            photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
+        )
+        before = appearance.color_map
+        return change if before is None else composed(before, change, self.photo_match.num_codes)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
