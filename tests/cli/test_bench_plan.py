@@ -94,8 +94,8 @@ def test_jobs_differ_in_what_they_should(landmark: Path, tmp_path: Path):
     [
         (("a:train.stebs=1",), (0,), "unknown entry 'stebs'"),
         (("a:train.steps=lots",), (0,), "--variant a: config.train.steps"),
-        (("a:train.steps=1", "a:train.steps=2"), (0,), "a is there twice"),
-        ((), (0, 0), "0 is there twice"),
+        (("a:train.steps=1", "a:train.steps=2"), (0,), "a is given twice"),
+        ((), (0, 0), "0 is given twice"),
     ],
 )
 def test_mistakes_are_found_before_training(landmark, tmp_path, variants, seeds, said):
@@ -104,7 +104,7 @@ def test_mistakes_are_found_before_training(landmark, tmp_path, variants, seeds,
 
 
 def test_two_scenes_of_one_name_are_refused(landmark, tmp_path):
-    with pytest.raises(UserError, match="scene is there twice"):
+    with pytest.raises(UserError, match="scene is given twice"):
         make_jobs([landmark, tmp_path / "scene"], BASE, ["wildgs"], [], (0,), tmp_path)
 
 

@@ -116,7 +116,8 @@ def match_photo(
     if keep is not None:
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
-    some = (slice(MATCH_EVERY // 2, None, MATCH_EVERY) if training else slice(None),) * 2
+    every = MATCH_EVERY if training else 1
+    some = tuple(slice(min(every // 2, side - 1), None, every) for side in photo.shape[:2])
     colors, photo, weights = rendering.colors[some], photo[some], weights[some]
     if sky is None:
         return match_colors(colors, photo, weights, training, codes[some])
