@@ -89,7 +89,7 @@ MISTAKES = {
         ("render", "{trained}", "--appearance", "x.jpg", "--output", "{tmp}/o"),
         "neither a photo",
     ),
-    "no photos": (("sfm", "{tmp}", "--output", "{tmp}/scene"), "no photo"),
+    "no photos": (("sfm", "{tmp}", "--output", "{tmp}/../scene-elsewhere"), "no photo"),
     "no room for a colour": (
         ("train", "{landmark}", "--output", "{tmp}/run", "--fusion.intrinsic-size", "2"),
         "intrinsic_size 2: must be 3 or more",
