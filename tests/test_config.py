@@ -76,6 +76,21 @@ def test_files_of_earlier_versions_open():
     assert from_plain(RunConfig, to_plain(vanilla)) == vanilla
 
 
+def test_runs_of_earlier_versions_resume_as_they_began():
+    """What their `config.yaml` does not name was not there when they began."""
+    plain = to_plain(BASE)
+    model, train = plain["model"], plain["train"]
+    for name in ("matched_loss", "light_codes", "light_components"):
+        assert model.pop(name) > 0
+    assert model["sky"].pop("densify") is False
+    assert train["optimizer"].pop("short_runs") > 0
+    config = from_plain(RunConfig, plain)
+    assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
+    assert config.model.sky.densify
+    assert config.train.optimizer.short_runs == 0
+    assert from_plain(RunConfig, to_plain(BASE)) == BASE
+
+
 def test_a_configuration_takes_its_own_methods_options_alone():
     assert RunConfig(Path("scene"), "3dgs").model == VanillaConfig()
     assert BASE.with_method("3dgs").with_method("wildgs") == BASE

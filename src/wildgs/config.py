@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import reprlib
 import types
@@ -32,9 +33,13 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.seed": (0, 2**63 - 1),
     "train.objective.weight_l1": (0, 1),
     "train.optimizer.means": (1e-12, _MOST),
+    "train.optimizer.short_runs": (0, 1),
     "train.density.reset_opacity": (1e-6, 1),
     "train.density.max_gaussians": (1, _MOST),
     "model.mask_threshold": (0, 1),
+    "model.matched_loss": (0, 1),
+    "model.light_codes": (0, 64),
+    "model.light_components": (0, 256),
     "model.parsing.max_side": (16, 4096),
     "model.parsing.global_size": (1, 1024),
     "model.fusion.intrinsic_size": (3, 1024),
@@ -196,12 +201,36 @@ _MOVED_RATES = {name: name for name in ("intrinsic", "networks", "encoder", "sh0
 """From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
 
 
+_BEFORE: dict[tuple[str, ...], tuple[str, Any]] = {
+    ("model", "matched_loss"): ("color_match", 0.0),
+    ("model", "light_codes"): ("color_match", 0),
+    ("model", "light_components"): ("color_match", 0),
+    ("model", "sky", "densify"): ("lowest", True),
+    ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
+}
+"""Entries that earlier versions' `config.yaml` does not have: an entry beside them that it does have, and the value
+with which a run that began so continues."""
+
+
+def _as_before(plain: dict[Any, Any]) -> dict[Any, Any]:
+    """The configuration of an earlier version's run, with what it did where there was no entry for it."""
+    plain = copy.deepcopy(plain)
+    for (*parents, name), (beside, value) in _BEFORE.items():
+        entries: Any = plain
+        for parent in parents:
+            entries = entries.get(parent) if isinstance(entries, dict) else None
+        if isinstance(entries, dict) and beside in entries:
+            entries.setdefault(name, value)
+    return plain
+
+
 def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
     """A run's configuration as an earlier version wrote it, in today's form.
 
     Learning rates of a method's own parameters were entries of `train.optimizer`, every method carried the default
     method's options, and `train.objective` repeated the mask's threshold.
     """
+    plain = _as_before(plain)
     known = _entries(config_type(_method_of(plain)))
     model = plain.get("model")
     if isinstance(model, dict):

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from wildgs.errors import UserError
 from wildgs.light.look import look_of, mix, own_look
-from wildgs.light.photos import encode_view
+from wildgs.light.photos import encode_picture, encode_view
 from wildgs.light.saved import load_look, save_look
 
 
@@ -103,3 +103,19 @@ def test_other_files_are_refused(method, look, tmp_path: Path, spoil, words) -> 
 def test_the_name_must_end_as_it_is_found_again(look, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"end in \.safetensors"):
         save_look(look, tmp_path / "evening.pt")
+
+
+def test_a_saved_picture_without_a_colour_map_mixes_with_a_photo(method, look, wall, tmp_path: Path) -> None:
+    """Pictures of other places are not matched; files of earlier versions say so by a map of zeros."""
+    photo = wall.views[0]
+    unmatched = look_of(method, encode_picture(method, photo.read_photo(), photo.camera), "picture")
+    assert unmatched.embeddings.color_map is None
+    file = tmp_path / "picture.safetensors"
+    save_look(unmatched, file)
+    for change in (lambda tensors: None, lambda tensors: tensors.update(color_map=torch.zeros(3, 4))):
+        _rewrite(file, unmatched, change)
+        back = load_look(method, file)
+        assert back.embeddings.color_map is None
+        mixed = mix([back, look], [0.5, 0.5])
+        torch.testing.assert_close(mixed.embeddings.color_map, 0.5 * look.embeddings.color_map)
+        assert mixed.sh.isfinite().all()

@@ -13,7 +13,6 @@ from wildgs.model.color_match import (
     SKY_COLUMNS,
     changed_harmonics,
     changed_picture,
-    composed,
     elevation_powers,
     mapped,
     match_colors,
@@ -134,15 +133,3 @@ def test_in_training_channels_do_not_mix() -> None:
     hue = torch.tensor([1.0, -1.0, 0.0])
     kept = (hue + free[:, :3] @ hue).norm() / hue.norm()
     assert float(kept) < 0.5, "the full map does take it away"
-
-
-@pytest.mark.parametrize("with_sky", [True, False])
-def test_two_changes_are_one_after_the_other(with_sky: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
-    colors, codes = (torch.rand(24, 30, n, generator=generator) for n in (3, 2))
-    sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
-    sky = Sky(sine > 0.4, sine) if with_sky else None
-    columns = 6 + (SKY_COLUMNS if with_sky else 0)
-    first, second = (torch.rand(3, columns, generator=generator) - 0.5 for _ in range(2))
-    expected = changed_picture(changed_picture(colors, first, sky, codes), second, sky, codes)
-    torch.testing.assert_close(changed_picture(colors, composed(first, second, 2), sky, codes), expected)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.model.light_basis import LEAST_PIXELS, LightBasis, fit_weights
+from wildgs.model.photo_match import FIT_SIDE, Sight
 from wildgs.model.registry import restore_method
 from wildgs.model.training_pass import SeenPhoto
 from wildgs.model.wildgs import WildGS
@@ -90,7 +91,7 @@ def test_components_span_the_lights_with_unit_variance(make_wall_model) -> None:
 def test_two_lights_are_no_basis(camera, make_wall_model) -> None:
     model = make_wall_model()
     photos = [SeenPhoto(photo_under(camera, a, 0), camera, None, str(a)) for a in (0, 1)]
-    model.finish(photos, 2)
+    model.finish(photos)
     assert model.basis_size == 0
     assert model.encode(photos[0].photo, camera).basis_weights is None
 
@@ -111,14 +112,18 @@ def test_pixels_that_do_not_count_are_not_read(camera, lit: WildGS) -> None:
     keep[:, : camera.width // 2] = False
     painted = photo.clone()
     painted[:, : camera.width // 2] = 1.0
+
+    def sight(photo: torch.Tensor, keep: torch.Tensor) -> Sight:
+        return Sight.reduced(lit.gaussians, photo, camera, None, keep)
+
     first, second = (
-        lit.light_basis.fit(lit, each, look, camera, keep).basis_weights for each in (photo, painted)
+        lit.light_basis.fit(lit, sight(each, keep), look).basis_weights for each in (photo, painted)
     )
     assert torch.equal(first, second)
     nothing = keep & False
     nothing.view(-1)[: LEAST_PIXELS // 2] = True
     assert (
-        lit.light_basis.fit(lit, photo, replace(look, basis_weights=None), camera, nothing).basis_weights
+        lit.light_basis.fit(lit, sight(photo, nothing), replace(look, basis_weights=None)).basis_weights
         is None
     )
 
@@ -128,7 +133,7 @@ def test_a_checkpoint_brings_the_basis_back_and_training_forgets_it(camera, lit:
     back = restore_method("wildgs", lit.config, lit.state_dict())
     assert torch.equal(back.encode(photo, camera).basis_weights, lit.encode(photo, camera).basis_weights)
     before = lit.fingerprint()
-    lit.finish((), 0)
+    lit.finish(())
     assert lit.basis_size == 0
     assert lit.fingerprint() != before, "saved weights would mean something else"
     assert restore_method("wildgs", lit.config, lit.state_dict()).encode(photo, camera).basis_weights is None
@@ -136,3 +141,30 @@ def test_a_checkpoint_brings_the_basis_back_and_training_forgets_it(camera, lit:
 
 def test_large_scenes_look_at_fewer_lights() -> None:
     assert LightBasis.affordable_lights(1000, 4) > LightBasis.affordable_lights(10_000_000, 16) > 1
+
+
+def test_large_photos_are_matched_small(camera, lit: WildGS) -> None:
+    large = camera.resized(16 * camera.width, 16 * camera.height)
+    sight = Sight.reduced(
+        lit.gaussians,
+        photo_under(large, 1, 0),
+        large,
+        torch.ones(large.height, large.width),
+        torch.ones(large.height, large.width, dtype=torch.bool),
+    )
+    assert sight.photo.shape == (FIT_SIDE * 4 // 5, FIT_SIDE, 3)
+    assert (sight.projection.camera.width, sight.projection.camera.height) == (FIT_SIDE, FIT_SIDE * 4 // 5)
+    assert sight.visibility.shape == sight.keep.shape == sight.photo.shape[:2]
+    assert sight.keep.all()
+    same = Sight.reduced(lit.gaussians, photo_under(camera, 1, 0), camera, None, None)
+    assert torch.equal(same.photo, photo_under(camera, 1, 0))
+    photo = photo_under(camera, 1, 0)
+    assert error(lit, camera, lit.encode(photo_under(large, 1, 0), large), photo) < 0.03
+
+
+def test_training_shows_no_more_photos_than_the_basis_takes(lit: WildGS) -> None:
+    assert lit.final_photos() == 96
+    lit.config = replace(lit.config, light_components=0)
+    assert lit.final_photos() == 0
+    lit.config = replace(lit.config, light_components=32, color_match=False)
+    assert lit.final_photos() == 0

@@ -24,7 +24,7 @@ def test_a_training_render_comes_near_the_exposure_of_its_photo(
     for value in (0.2, 0.8):
         means = []
         for matched in (0.0, share):
-            model.photo_match.config = replace(model.config, matched_loss=matched)
+            model.config = replace(model.config, matched_loss=matched)
             rendering = model.training_pass(grey_photo(camera, value), camera, Stage()).rendering
             means.append(float(rendering.colors.detach()[8:-8, 8:-8].mean()))
         assert means[1] == pytest.approx(means[0] + share * (value - means[0]), abs=0.02)
@@ -61,3 +61,14 @@ def test_checkpoints_without_codes_are_read(camera, make_wall_model) -> None:
 def test_codes_need_intrinsic_features(without, make_wall_model) -> None:
     config = replace(make_wall_model().config, without=without)
     assert (PhotoMatch(config).codes is None) == bool(without)
+
+
+@pytest.mark.parametrize("value", [-0.6, 0.2, 0.9])
+def test_scenes_below_black_are_matched(camera, make_wall_model, value: float) -> None:
+    """Also those that are below black everywhere, and are rendered as if they were black."""
+    model = make_wall_model()
+    with torch.no_grad():
+        model.fusion.output.bias[:3] += (value - 0.5) / 0.28209479177387814
+        photo = grey_photo(camera, 0.7)
+        rendered = model.render(camera, model.shade(model.encode(photo, camera))).colors[8:-8, 8:-8]
+    torch.testing.assert_close(rendered, photo[8:-8, 8:-8], atol=0.03, rtol=0)

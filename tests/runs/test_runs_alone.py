@@ -180,6 +180,8 @@ def test_the_same_scene_elsewhere_may_go_on(trained: Path, old: Path, landmark: 
     shutil.copytree(landmark, copy)
     for folder in (trained, old):
         require_same_scene(folder, load_scene(copy))
+        trainer = prepare_training(folder, read_config(folder / CONFIG_FILE), load_scene(copy), resume=True)
+        assert [view.name for view in trainer.views] == [view.name for view in load_scene(copy).train_views]
 
 
 def test_a_look_of_another_run_is_refused(trained: Path) -> None:

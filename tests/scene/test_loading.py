@@ -458,7 +458,9 @@ def test_masks_of_photos_without_a_pose_are_no_mistake(make_scene: MakeScene) ->
     (root / "masks").mkdir()
     Image.fromarray(photo()).save(root / "images" / "unregistered.png")
     Image.linear_gradient("L").resize((W, H)).save(root / "masks" / "unregistered.png")
-    load_scene(root)
+    scene = load_scene(root)  # no warning
+    assert len(scene.views) == 3
+    assert all(view.read_mask() is None for view in scene.views)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")

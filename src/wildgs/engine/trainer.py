@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,6 +31,7 @@ from wildgs.model.precision import (
     switch_replays,
 )
 from wildgs.model.training_pass import SeenPhoto, TrainingOutput
+from wildgs.progress import Counter
 from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
 from wildgs.scene.scene import observed_pixels
@@ -84,6 +85,7 @@ class Trainer:
     """Trains a method on a scene's training photos.
 
     Attributes:
+        on_final_photo: Called with (photos shown, photos in all) while the method sees photos after the last step.
         cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
         feature_cache: Bytes for the features that a frozen encoder gave of training photos.
         skips_on_device: Whether steps that are not finite are skipped without waiting for the device.
@@ -126,6 +128,7 @@ class Trainer:
         self.guard = StepGuard()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
+        self.on_final_photo: Counter = lambda done, total: None
         self.cuda_graphs = True
         self.feature_cache = FEATURE_CACHE_BYTES
 
@@ -271,7 +274,7 @@ class Trainer:
         budget = self.config.density.max_gaussians
         excess = self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
         if excess:
-            self.method.finish((), 0)
+            self.method.finish(())
             if self.step >= self.config.steps:
                 self._finish()
         return excess
@@ -284,16 +287,20 @@ class Trainer:
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
     def _finish(self) -> None:
-        """Shows the method the training photos once more."""
+        """Shows the method some training photos once more."""
         start = time.perf_counter()
         switch_replays(self.method, False)
-        readable = [view for view in self.views if self.feed.is_readable(view)]
-        self.method.finish(map(self._seen, readable), len(readable))
+        self.method.finish(self._final_photos())
         self.seconds += time.perf_counter() - start
 
-    def _seen(self, view: View) -> SeenPhoto:
-        photo, keep = self.feed.photo(view)
-        return SeenPhoto(photo, self.feed.camera(view), keep, view.name)
+    def _final_photos(self) -> Iterator[SeenPhoto]:
+        count = min(self.method.final_photos(), len(self.views))
+        for number in range(count):
+            view = self.views[number * len(self.views) // count]
+            if self.feed.is_readable(view):
+                photo, keep = self.feed.photo(view)
+                yield SeenPhoto(photo, self.feed.camera(view), keep, view.name)
+            self.on_final_photo(number + 1, count)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that training needs to continue exactly, as flat tensors."""
@@ -321,7 +328,7 @@ class Trainer:
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
         if self.step < self.config.steps:
-            self.method.finish((), 0)
+            self.method.finish(())
 
 
 def _under(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

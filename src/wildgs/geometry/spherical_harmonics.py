@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 MAX_DEGREE = 3
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -69,6 +70,17 @@ def sh_basis(degree: int, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor
                 -C3[0] * x * (xx - 3 * yy),
             ]
     return torch.stack(values, dim=-1)
+
+
+def sh_values(sh: Float[Tensor, "N K 3"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Harmonics seen from one direction each, without the offset and the clamp of `wildgs.rasterize.sh_to_colors`.
+
+    Args:
+        sh: Coefficients of all degrees up to one.
+        directions: From the camera's centre to the Gaussians, of any length.
+    """
+    bases = sh_basis(sh_degree(sh), functional.normalize(directions, dim=-1))
+    return torch.einsum("nk, nkc -> nc", bases, sh)
 
 
 def rgb_to_sh0(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.evaluation.metrics import to_8bit
@@ -146,7 +147,8 @@ def write_showcase(
     misfits = find_misfits(fits)
     lights = different_lights(_without(scene.train_views, misfits), LIGHTS + 1)
     with torch.no_grad():
-        examples = tuple(_example(view, lights, shown, baseline) for view in chosen)
+        shaded = [(light, shown.shade(encode_view(shown, light))) for light in lights]
+        examples = tuple(_example(view, shaded, shown, baseline) for view in chosen)
     methods = tuple(MethodScores.from_metrics(name, {**scores}) for name, _, scores in runs if scores)
     others = [fit for fit in fits if fit.hidden is not None and fit not in misfits]
     others.sort(key=lambda fit: (fit.static_hidden or 0.0, fit.hidden or 0.0), reverse=True)
@@ -202,7 +204,13 @@ def _colour_of(view: View) -> Tensor:
     return torch.cat([pixels.mean(dim=0), pixels.std(dim=0)])
 
 
-def _example(view: View, lights: Sequence[View], method: Method, baseline: Method | None) -> ReportExample:
+def _example(
+    view: View,
+    lights: Sequence[tuple[View, Float[Tensor, "N K 3"]]],
+    method: Method,
+    baseline: Method | None,
+) -> ReportExample:
+    """A view's pictures, also under other photos' lights, which are given as shaded harmonics."""
     device = method.gaussians.means.device
     camera = view.camera.to(device)
     appearance = encode_view(method, view)
@@ -211,8 +219,8 @@ def _example(view: View, lights: Sequence[View], method: Method, baseline: Metho
     visibility = appearance.visibility
     mask = torch.ones_like(depth) if visibility is None else visibility
     relit = tuple(
-        (light.name, light.read_photo().numpy(), _picture(method, view, light))
-        for light in [light for light in lights if light.name != view.name][:LIGHTS]
+        (light.name, light.read_photo().numpy(), _picture(method, view, sh))
+        for light, sh in [(light, sh) for light, sh in lights if light.name != view.name][:LIGHTS]
     )
     clean = view.read_clean() if view.split == "test" else None
     return ReportExample(
@@ -222,11 +230,12 @@ def _example(view: View, lights: Sequence[View], method: Method, baseline: Metho
         mask=(mask * 255).byte().cpu().numpy(),
         depth=depth.cpu().numpy(),
         clean=None if clean is None else clean.numpy(),
-        baseline=None if baseline is None else _picture(baseline, view, view),
+        baseline=None
+        if baseline is None
+        else _picture(baseline, view, baseline.shade(encode_view(baseline, view))),
         relit=relit,
     )
 
 
-def _picture(method: Method, view: View, light: View) -> np.ndarray:
-    sh = method.shade(encode_view(method, light))
+def _picture(method: Method, view: View, sh: Float[Tensor, "N K 3"]) -> np.ndarray:
     return to_8bit(method.render(view.camera.to(sh.device), sh).colors).cpu().numpy()

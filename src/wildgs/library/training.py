@@ -231,6 +231,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
         trainer.feature_cache = parse_bytes(job.execution.feature_cache)
+        trainer.on_final_photo = counter(job.progress, "learning the lights of training photos")
         with ExitStack() as stack:
             if job.team.first:
                 observers = [stack.enter_context(open_one(trainer, job.scene)) for open_one in job.attach]

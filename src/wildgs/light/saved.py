@@ -75,11 +75,9 @@ def load_look(method: Method, file: Path) -> Look:
 
 def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
     """Embeddings as the file's tensors."""
-    color_map = embeddings.color_map
-    tensors = {
-        "color_map": torch.zeros(3, 4) if color_map is None else color_map.detach().cpu().contiguous(),
-        "global_embedding": embeddings.global_embedding.detach().cpu().float().contiguous(),
-    }
+    tensors = {"global_embedding": embeddings.global_embedding.detach().cpu().float().contiguous()}
+    if embeddings.color_map is not None:
+        tensors["color_map"] = embeddings.color_map.detach().cpu().contiguous()
     if embeddings.basis_weights is not None:
         tensors["basis_weights"] = embeddings.basis_weights.detach().cpu().contiguous()
     if embeddings.local_embeddings is None:
@@ -97,10 +95,12 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
 def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     """A file's embeddings for a method's Gaussians; raises `KeyError` or `ValueError` if they do not fit."""
     device = method.gaussians.means.device
-    common, color_map = tensors["global_embedding"].float(), tensors["color_map"].float()
+    common, color_map = tensors["global_embedding"], tensors.get("color_map")
     if common.shape != (method.global_size,):
         raise ValueError("embeddings of another length")
-    if color_map.shape not in ((3, 4), (3, method.map_columns)):
+    if color_map is not None and color_map.shape == (3, 4) and not color_map.any():
+        color_map = None  # as earlier versions wrote it
+    if color_map is not None and color_map.shape != (3, method.map_columns):
         raise ValueError("a colour map of another shape")
     weights = tensors.get("basis_weights")
     if weights is not None and weights.shape != (method.basis_size,):

@@ -67,7 +67,7 @@ def match_colors(
     """The affine map of colours that takes a render to its photo, by robust least squares.
 
     Args:
-        render: In 0..1, more where the scene is brighter than white.
+        render: In 0..1, more where the scene is brighter than white, less where it is below black.
         photo: In 0..1.
         weights: Of the pixels, 0 or more; 0 where something stands in the way.
         training: Whether each channel has a gain of its own and no share in the others.
@@ -163,20 +163,6 @@ def changed_picture(
     return torch.where(sky.which[..., None], above, below)
 
 
-def composed(first: Float[Tensor, "3 M"], second: Float[Tensor, "3 M"], codes: int) -> Float[Tensor, "3 M"]:
-    """The change that does what one does and then the other.
-
-    Args:
-        first: From `match_photo`.
-        second: From `match_photo`, of the render that the first one changed.
-        codes: Number of light codes.
-    """
-    columns = (4 + codes, first.shape[1] - 4 - codes)
-    blocks = zip(first.split(columns, dim=1), second.split(columns, dim=1), strict=True)
-    parts = [one + other + other[:, :3] @ one for one, other in blocks if one.shape[1]]
-    return torch.cat(parts, dim=1)
-
-
 def _split(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
     """[A | b] of the landmark and what its codes change, the same of the sky and its elevation."""
     return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)
@@ -193,7 +179,7 @@ def match_sky(
     """As `match_colors`, for the sky: the change may vary smoothly with the elevation.
 
     Args:
-        render: In 0..1, more where the scene is brighter than white.
+        render: In 0..1, more where the scene is brighter than white, less where it is below black.
         photo: In 0..1.
         weights: Of the pixels; 0 where there is no sky.
         sine: Of the elevation at which a pixel shows the sky.
@@ -218,7 +204,7 @@ def _fitted(
     """
     counts = (weights > 0).reshape(-1)
     base = torch.where(counts, weights.reshape(-1), 0).double()
-    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(0, 1), 0).double()
+    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(max=1), 0).double()
     residual = torch.where(counts[:, None], photo.reshape(-1, 3), 0).double() - colors
     further = further.reshape(len(colors), -1).double()
     # A leading axis of problems: one of three channels, or one for each channel.

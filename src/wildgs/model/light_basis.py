@@ -14,13 +14,12 @@ from dataclasses import replace
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional
 
-from wildgs.geometry.camera import Camera
-from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
+from wildgs.geometry.spherical_harmonics import sh_values
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
+from wildgs.model.photo_match import Sight
 from wildgs.model.wrapping import liftable
 from wildgs.rasterize import Projection, blend
 
@@ -28,8 +27,6 @@ MOST_LIGHTS = 96
 """Photos whose lights are looked at; of larger collections as many, evenly spread."""
 LIGHTS_BYTES, BASIS_BYTES = 2**31, 2**29
 """Limits of all lights while the basis is learnt, and of the basis that is kept."""
-FIT_SIDE = 256
-"""A photo is fitted at this many pixels along its long side: light is of low frequency."""
 RIDGE = 5e-6
 """Of the least squares, per squared standard deviation of the training photos along a component."""
 OUTLIER = 0.1
@@ -99,14 +96,7 @@ class LightBasis(nn.Module):
         return (weights.to(chosen.dtype) @ chosen.flatten(1)).float().reshape(chosen.shape[1:])
 
     @torch.no_grad()
-    def fit(
-        self,
-        method: Method,
-        photo: Float[Tensor, "H W 3"],
-        appearance: Appearance,
-        camera: Camera,
-        keep: Tensor | None,
-    ) -> Appearance:
+    def fit(self, method: Method, sight: Sight, appearance: Appearance) -> Appearance:
         """Adds the weights that bring the render under an appearance nearest to the photo.
 
         Robust ridge regression: its prior is that a photo's light differs from the guess by no more than training
@@ -114,27 +104,22 @@ class LightBasis(nn.Module):
 
         Args:
             method: Shades and renders.
-            photo: RGB in [0, 1].
+            sight: The photo.
             appearance: The guess.
-            camera: The photo's.
-            keep: The user's own mask: pixels that are False do not count.
         """
         if self.components is None:
             return appearance
-        scale = min(1.0, FIT_SIDE / max(photo.shape[:2]))
-        height, width = (max(1, round(side * scale)) for side in photo.shape[:2])
-        camera = camera.resized(width, height)
-        projection = method.gaussians.project(camera)
-        rendering = blend(projection, method.paint(projection, appearance, method.sh_degree))
-        visibility = None if appearance.visibility is None else _resized(appearance.visibility, height, width)
+        projection, visibility = sight.projection, sight.visibility
+        colors = method.paint(projection, appearance, method.sh_degree, clamped=False)
+        rendering = blend(projection, colors)
         counts = liftable(visibility, rendering.alpha, method.mask_threshold).float()
         if visibility is not None:
             counts = counts * visibility
-        if keep is not None:
-            counts = counts * (_resized(keep.float(), height, width) > 0.5)
+        if sight.keep is not None:
+            counts = counts * sight.keep
         if int((counts > 0).sum()) < LEAST_PIXELS:
             return appearance
-        residual = _resized(photo, height, width) - rendering.colors.clamp(0, 1)
+        residual = sight.photo - rendering.colors.clamp(max=1)
         images = self._images(projection, method.gaussians.means)
         return replace(appearance, basis_weights=fit_weights(images, residual, counts))
 
@@ -142,12 +127,10 @@ class LightBasis(nn.Module):
         """Pictures of the components."""
         assert self.components is not None
         rows = projection.visible.nonzero()[:, 0]
-        towards = functional.normalize(means[rows] - projection.camera.position, dim=-1)
-        degree = round(self.components.shape[2] ** 0.5) - 1
-        bases = sh_basis(degree, towards)[:, : num_sh_bases(degree)]
+        towards = means[rows] - projection.camera.position
         pictures = []
         for component in self.components:
-            seen = torch.einsum("nk, nkc -> nc", bases, component[rows].float())
+            seen = sh_values(component[rows].float(), towards)
             colors = torch.zeros_like(means).index_copy(0, rows, seen)
             pictures.append(blend(projection, colors, depth=False).colors)
         return torch.stack(pictures)
@@ -188,12 +171,3 @@ def _importance(gaussians: Gaussians) -> Float[Tensor, " N"]:
     seen = gaussians.opacities * largest / distance.square()
     seen = seen.clamp_max(float(seen[:: 1 + len(seen) // 100_000].quantile(0.99)))
     return seen / seen.sum()
-
-
-def _resized(values: Float[Tensor, "H W *C"], height: int, width: int) -> Float[Tensor, "h w *C"]:
-    """A picture at another size, averaged."""
-    if values.shape[:2] == (height, width):
-        return values
-    picture = values.reshape(*values.shape[:2], -1).permute(2, 0, 1)[None]
-    small = functional.interpolate(picture, size=(height, width), mode="bilinear", antialias=True)
-    return small[0].permute(1, 2, 0).reshape(height, width, *values.shape[2:])

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
+from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_values
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, mean_embeddings
 from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
 from wildgs.model.gaussians import Gaussians, rows_to_shade, take_rows
@@ -123,12 +124,15 @@ class Method(nn.Module, ABC):
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
         """Looks at some training photos (RGB in [0, 1]) once, before the first step."""
 
-    def finish(self, photos: Iterable[SeenPhoto], count: int) -> None:
-        """Looks at the training photos once more, after the last step.
+    def final_photos(self) -> int:
+        """How many training photos `finish` looks at, at most."""
+        return 0
+
+    def finish(self, photos: Iterable[SeenPhoto]) -> None:
+        """Looks at `final_photos` training photos, evenly spread, after the last step.
 
         Args:
-            photos: Read one at a time; none where training continues: what was learnt from them is forgotten.
-            count: How many there are.
+            photos: Read one at a time. None where training continues: what was learnt from them is forgotten.
         """
 
     def encode(
@@ -209,12 +213,26 @@ class Method(nn.Module, ABC):
                 digest.update(state[key].detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:32]
 
-    def paint(self, projection: Projection, appearance: Appearance, sh_degree: int) -> Float[Tensor, "N 3"]:
-        """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded."""
+    def paint(
+        self, projection: Projection, appearance: Appearance, sh_degree: int, *, clamped: bool = True
+    ) -> Float[Tensor, "N 3"]:
+        """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded.
+
+        Args:
+            projection: Of the camera.
+            appearance: The light.
+            sh_degree: Evaluated degree of the harmonics.
+            clamped: Whether colours below black become black, as they are shown. What is to be changed is better
+                seen as it is: a change acts on the harmonics.
+        """
         means = self.gaussians.means
         rows = rows_to_shade(projection.visible)
         sh = self.shade(appearance, rows)
-        seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
+        if clamped:
+            seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
+        else:
+            towards = take_rows(means, rows) - projection.camera.position
+            seen = 0.5 + sh_values(sh[:, : num_sh_bases(sh_degree)], towards)
         return torch.zeros_like(means).index_copy(0, rows, seen)
 
     def training_pass(

@@ -5,16 +5,79 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn import functional
 
+from wildgs.geometry.camera import Camera
 from wildgs.model.color_match import SKY_COLUMNS, changed_harmonics, changed_picture, match_photo
 from wildgs.model.config import WildGSConfig
+from wildgs.model.gaussians import Gaussians
 from wildgs.model.sky import Sky, find_sky
 from wildgs.rasterize import Projection, Rendering, blend
+
+FIT_SIDE = 320
+"""Pixels along the long side, at most, at which an encoded photo is matched: light is of low frequency."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A photo, and the Gaussians as its camera sees them.
+
+    Attributes:
+        photo: RGB in [0, 1].
+        projection: Into the photo's camera.
+        visibility: M; None where all of the photo is static.
+        keep: The user's own mask: pixels that are False do not count.
+    """
+
+    photo: Float[Tensor, "H W 3"]
+    projection: Projection
+    visibility: Float[Tensor, "H W"] | None
+    keep: Bool[Tensor, "H W"] | None
+
+    @classmethod
+    def reduced(
+        cls,
+        gaussians: Gaussians,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        visibility: Float[Tensor, "H W"] | None,
+        keep: Bool[Tensor, "H W"] | None,
+    ) -> Sight:
+        """At `FIT_SIDE` pixels, at most."""
+        scale = min(1.0, FIT_SIDE / max(photo.shape[:2]))
+        height, width = (max(1, round(side * scale)) for side in photo.shape[:2])
+        camera = camera.resized(width, height)
+        return cls(
+            _resized(photo, height, width),
+            gaussians.project(camera),
+            None if visibility is None else _resized(visibility, height, width),
+            None if keep is None else _resized(keep.float(), height, width) > 0.5,
+        )
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A rendering with what its colours may be changed by.
+
+    Attributes:
+        rendering: Colours, depth and alpha.
+        codes: The light codes in its pixels.
+        sky: Which pixels show the sky; None for a scene without one.
+    """
+
+    rendering: Rendering
+    codes: Float[Tensor, "H W L"]
+    sky: Sky | None
+
+    def changed(self, change: Float[Tensor, "3 M"]) -> Rendering:
+        """The rendering with its colours changed."""
+        colors = changed_picture(self.rendering.colors, change, self.sky, self.codes)
+        return replace(self.rendering, colors=colors)
 
 
 class PhotoMatch(nn.Module):
@@ -54,32 +117,37 @@ class PhotoMatch(nn.Module):
         """What is sky among points of a scene with this centre; None where there is none."""
         return find_sky(self.config.sky, points.detach(), centre)
 
-    @torch.no_grad()
-    def find(
+    def picture(
         self,
-        photo: Float[Tensor, "H W 3"],
         projection: Projection,
         colors: Float[Tensor, "N 3"],
         intrinsic: Float[Tensor, "N I"],
         centre: Float[Tensor, " 3"],
-        visibility: Float[Tensor, "H W"] | None,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Float[Tensor, "3 M"]:
-        """The change that takes the scene's colours to those of a photo.
+    ) -> Picture:
+        """Renders colours and light codes of the Gaussians, and finds the sky; gradients flow to the first two."""
+        blended = blend(projection, torch.cat([colors, self.light_codes(intrinsic)], dim=1))
+        rendering = replace(blended, colors=blended.colors[..., :3])
+        sky = self.sky(projection.camera.unproject(blended.depth.detach()), centre)
+        return Picture(rendering, blended.colors[..., 3:], sky)
+
+    def find(self, sight: Sight, picture: Picture, *, training: bool = False) -> Float[Tensor, "3 M"]:
+        """The change that takes the colours of a picture to those of the photo, without gradient.
 
         Args:
-            photo: RGB in [0, 1].
-            projection: The Gaussians as the photo's camera sees them.
-            colors: Of the Gaussians.
-            intrinsic: f^in.
-            centre: Of the scene.
-            visibility: M.
-            keep: The user's own mask: pixels that are False do not count.
+            sight: The photo.
+            picture: From its camera.
+            training: Fewer pixels, and a gain for each channel; see `match_photo`.
         """
-        rendering, codes = self._blend(projection, colors, intrinsic)
-        sky = self.sky(projection.camera.unproject(rendering.depth), centre)
-        threshold = self.config.mask_threshold
-        return match_photo(photo, rendering, visibility, keep, threshold=threshold, sky=sky, codes=codes)
+        return match_photo(
+            sight.photo,
+            picture.rendering,
+            sight.visibility,
+            sight.keep,
+            threshold=self.config.mask_threshold,
+            sky=picture.sky,
+            codes=picture.codes,
+            training=training,
+        )
 
     def harmonics(
         self,
@@ -92,32 +160,11 @@ class PhotoMatch(nn.Module):
         """The harmonics of changed colours."""
         return changed_harmonics(harmonics, change, self.sky(means, centre), self.light_codes(intrinsic))
 
-    def training_render(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        projection: Projection,
-        colors: Float[Tensor, "N 3"],
-        intrinsic: Float[Tensor, "N I"],
-        centre: Float[Tensor, " 3"],
-        visibility: Float[Tensor, "H W"] | None,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Rendering:
-        """The render that the loss compares with a photo; no gradient reaches the match itself. See `find`."""
-        share = self.config.matched_loss
-        if not (self.config.color_match and share):
-            return blend(projection, colors)
-        rendering, codes = self._blend(projection, colors, intrinsic)
-        threshold = self.config.mask_threshold
-        with torch.no_grad():
-            sky = self.sky(projection.camera.unproject(rendering.depth), centre)
-            change = share * match_photo(
-                photo, rendering, visibility, keep, threshold=threshold, sky=sky, codes=codes, training=True
-            )
-        return replace(rendering, colors=changed_picture(rendering.colors, change, sky, codes))
 
-    def _blend(
-        self, projection: Projection, colors: Float[Tensor, "N 3"], intrinsic: Float[Tensor, "N I"]
-    ) -> tuple[Rendering, Float[Tensor, "H W L"]]:
-        """A rendering, and the light codes in its pixels."""
-        rendering = blend(projection, torch.cat([colors, self.light_codes(intrinsic)], dim=1))
-        return replace(rendering, colors=rendering.colors[..., :3]), rendering.colors[..., 3:]
+def _resized(values: Float[Tensor, "H W *C"], height: int, width: int) -> Float[Tensor, "h w *C"]:
+    """A picture at another size, averaged."""
+    if values.shape[:2] == (height, width):
+        return values
+    picture = values.reshape(*values.shape[:2], -1).permute(2, 0, 1)[None]
+    small = functional.interpolate(picture, size=(height, width), mode="bilinear", antialias=True)
+    return small[0].permute(1, 2, 0).reshape(height, width, *values.shape[2:])

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
-from wildgs.model.color_match import composed
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
@@ -21,14 +20,11 @@ from wildgs.model.initial import InitialGaussians
 from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
-from wildgs.model.photo_match import PhotoMatch
+from wildgs.model.photo_match import PhotoMatch, Picture, Sight
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
 from wildgs.rasterize import Projection, blend
-
-MATCHES = 3
-"""Colour matches of a photo that is encoded, one after the other."""
 
 
 class WildGS(Method):
@@ -139,18 +135,18 @@ class WildGS(Method):
         """Gives a fresh encoder its normalisation statistics."""
         self.parsing.calibrate(photos)
 
+    def final_photos(self) -> int:
+        """As many as the basis of lights can be learnt from."""
+        if not (self.config.color_match and self.config.light_components):
+            return 0
+        return self.light_basis.affordable_lights(self.num_gaussians, (self.sh_degree + 1) ** 2)
+
     @torch.no_grad()
-    def finish(self, photos: Iterable[SeenPhoto], count: int) -> None:
+    def finish(self, photos: Iterable[SeenPhoto]) -> None:
         """Learns the basis of lights."""
-        self.light_basis.components = None
-        if not self.config.color_match:
-            return
-        most = self.light_basis.affordable_lights(self.num_gaussians, (self.sh_degree + 1) ** 2)
-        chosen = {number * count // most for number in range(most)} if count > most else set(range(count))
+        self.light_basis.components = None  # or the lights would be fitted in the old one
         lights = (
-            self.shade(self.encode(seen.photo, seen.camera, seen.keep, name=seen.name))
-            for number, seen in enumerate(photos)
-            if number in chosen
+            self.shade(self.encode(seen.photo, seen.camera, seen.keep, name=seen.name)) for seen in photos
         )
         self.light_basis.learn(lights, self.gaussians, self.config.light_components)
 
@@ -177,27 +173,14 @@ class WildGS(Method):
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
         if not (self.config.color_match and trust_mask):
             return appearance
-        # Colours below black are rendered as black: what the first match lifts above it, the second one sees.
-        for _ in range(MATCHES):
-            appearance = replace(appearance, color_map=self._match(photo, appearance, projection, keep))
-        return self.light_basis.fit(self, photo, appearance, camera, keep)
+        sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
+        with torch.no_grad():
+            colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
+            change = self.photo_match.find(sight, self._picture(sight.projection, colors))
+        return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
 
-    @torch.no_grad()
-    def _match(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        appearance: Appearance,
-        projection: Projection,
-        keep: Bool[Tensor, "H W"] | None,
-    ) -> Float[Tensor, "3 M"]:
-        """An appearance's colour map, and after it what its own render of the photo is still off by."""
-        colors = self.paint(projection, appearance, self.sh_degree)
-        intrinsic = self.gaussians.rows["intrinsic"]
-        change = self.photo_match.find(
-            photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
-        )
-        before = appearance.color_map
-        return change if before is None else composed(before, change, self.photo_match.num_codes)
+    def _picture(self, projection: Projection, colors: Float[Tensor, "N 3"]) -> Picture:
+        return self.photo_match.picture(projection, colors, self.gaussians.rows["intrinsic"], self._centre)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -306,8 +289,9 @@ class WildGS(Method):
         if stage.explicit and not self._lacks("local"):
             appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         colors = self.paint(projection, appearance, stage.sh_degree)
-        intrinsic = self.gaussians.rows["intrinsic"]
-        rendering = self.photo_match.training_render(
-            photo, projection, colors, intrinsic, self._centre, appearance.visibility, keep
-        )
-        return TrainingOutput(rendering, projection, appearance.visibility)
+        if not (self.config.color_match and self.config.matched_loss):
+            return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
+        picture = self._picture(projection, colors)
+        sight = Sight(photo, projection, appearance.visibility, keep)
+        change = self.config.matched_loss * self.photo_match.find(sight, picture, training=True)
+        return TrainingOutput(picture.changed(change), projection, appearance.visibility)
