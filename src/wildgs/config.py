@@ -207,6 +207,8 @@ _BEFORE: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "light_components"): ("color_match", 0),
     ("model", "sky", "densify"): ("lowest", True),
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
+    ("train", "schedule", "mask_every"): ("mask_pause", 1),
+    ("train", "schedule", "planes_every"): ("mask_pause", 1),
 }
 """Entries that earlier versions' `config.yaml` does not have: an entry beside them that it does have, and the value
 with which a run that began so continues."""

@@ -43,6 +43,8 @@ _PAPER: dict[str, Any] = {
     "model.matched_loss": 0.0,
     "train.objective.depth_weight": 0.05,
     "train.schedule.encoder_every": 1,
+    "train.schedule.mask_every": 1,
+    "train.schedule.planes_every": 1,
     "train.optimizer.short_runs": 0.0,
     "train.density.prune_by_distance": False,
     "train.density.prune_reach": 0.0,

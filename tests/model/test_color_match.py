@@ -11,8 +11,8 @@ from wildgs.geometry.spherical_harmonics import C0
 from wildgs.model.color_match import (
     LEAST_PIXELS,
     SKY_COLUMNS,
+    changed_colors,
     changed_harmonics,
-    changed_picture,
     elevation_powers,
     mapped,
     match_colors,
@@ -90,7 +90,7 @@ def test_mapped_harmonics_are_those_of_mapped_colours() -> None:
     torch.testing.assert_close(found, changed(colors, change) + offset)
 
 
-def test_a_changed_picture_is_the_picture_of_changed_harmonics() -> None:
+def test_changed_colors_are_those_of_changed_harmonics() -> None:
     generator = torch.Generator().manual_seed(0)
     colors = torch.rand(24, 30, 3, generator=generator)
     codes = torch.rand(24, 30, 2, generator=generator)
@@ -102,9 +102,9 @@ def test_a_changed_picture_is_the_picture_of_changed_harmonics() -> None:
     for of_picture, of_rows in ((sky, rows), (None, None)):
         harmonics = changed_harmonics(flat, change, of_rows, codes.reshape(-1, 2))
         expected = (C0 * harmonics + 0.5).reshape(colors.shape)
-        torch.testing.assert_close(changed_picture(colors, change, of_picture, codes), expected)
+        torch.testing.assert_close(changed_colors(colors, change, of_picture, codes), expected)
     expected = changed(colors, change[:, :4]) + codes @ change[:, 4:6].T
-    torch.testing.assert_close(changed_picture(colors, change, None, codes), expected)
+    torch.testing.assert_close(changed_colors(colors, change, None, codes), expected)
 
 
 def test_light_that_follows_the_codes_is_found() -> None:
@@ -115,7 +115,7 @@ def test_light_that_follows_the_codes_is_found() -> None:
     photo = 0.8 * render + 0.15 * codes
     for training in (False, True):
         found = match_colors(render, photo, torch.ones(24, 30), training, codes)
-        torch.testing.assert_close(changed_picture(render, found, None, codes), photo, atol=0.01, rtol=0)
+        torch.testing.assert_close(changed_colors(render, found, None, codes), photo, atol=0.01, rtol=0)
 
 
 def test_in_training_channels_do_not_mix() -> None:

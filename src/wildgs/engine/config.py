@@ -24,6 +24,8 @@ class ScheduleConfig:
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
         encoder_every: The photo's encoder learns on one step in so many (not scaled; paper: 1).
+        mask_every: The visibility mask learns on one step in so many (not scaled; paper: 1).
+        planes_every: The triplane's UNet learns on one step in so many (not scaled; paper: 1).
     """
 
     first_stage: int = 3000
@@ -34,11 +36,13 @@ class ScheduleConfig:
     mask_pause: int = 500
     sh_every: int = 1000
     encoder_every: int = 2
+    mask_every: int = 2
+    planes_every: int = 2
 
     def __post_init__(self) -> None:
         """Refuses negative steps, and 0 where it means nothing."""
         for name, value in vars(self).items():
-            least = 1 if name in ("sh_every", "encoder_every") else 0
+            least = 1 if name in ("sh_every", "encoder_every", "mask_every", "planes_every") else 0
             if value < least:
                 raise UserError(f"schedule.{name} {value}: must be {least} or more")
 

@@ -29,6 +29,8 @@ class Schedule:
         """Scales a configuration in the paper's steps to a run of `steps`."""
         self.steps = steps
         self.encoder_every = config.encoder_every
+        self.mask_every = config.mask_every
+        self.planes_every = config.planes_every
         self._factor = steps / REFERENCE_STEPS
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
@@ -56,9 +58,11 @@ class Schedule:
         """The stage at a step (from 0) that counts for `taken` steps; `sh_degree` is the method's full degree."""
         return Stage(
             explicit=step >= self.first_stage,
-            learn_mask=not self.mask_paused(step),
+            learn_mask=not self.mask_paused(step) and falls_on(step + taken - 1, taken, self.mask_every),
             sh_degree=min(step // self.sh_every, sh_degree),
             learn_encoder=falls_on(step + taken - 1, taken, self.encoder_every),
+            # On other steps than the mask, so that all steps take alike.
+            learn_planes=falls_on(step + taken, taken, self.planes_every),
         )
 
     def mask_paused(self, step: int) -> bool:

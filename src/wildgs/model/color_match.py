@@ -148,18 +148,18 @@ def changed_harmonics(
     return torch.where(sky.which[:, None, None], above, below)
 
 
-def changed_picture(
-    render: Float[Tensor, "H W 3"],
+def changed_colors(
+    colors: Float[Tensor, "*batch 3"],
     change: Float[Tensor, "3 M"],
     sky: Sky | None,
-    codes: Float[Tensor, "H W L"],
-) -> Float[Tensor, "H W 3"]:
-    """A render of changed colours, pixel by pixel; see `changed_harmonics`."""
-    own, by_code, of_sky, by_elevation = _split(change, codes.shape[2])
-    below = render + render @ own[:, :3].T + own[:, 3] + codes @ by_code.T
+    codes: Float[Tensor, "*batch L"],
+) -> Float[Tensor, "*batch 3"]:
+    """Colours of Gaussians or of pixels, changed; see `changed_harmonics`."""
+    own, by_code, of_sky, by_elevation = _split(change, codes.shape[-1])
+    below = colors + colors @ own[:, :3].T + own[:, 3] + codes @ by_code.T
     if sky is None:
         return below
-    above = render + render @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
+    above = colors + colors @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
     return torch.where(sky.which[..., None], above, below)
 
 

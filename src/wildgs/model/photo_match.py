@@ -13,12 +13,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.geometry.camera import Camera
-from wildgs.model.color_match import SKY_COLUMNS, changed_harmonics, changed_picture, match_photo
+from wildgs.model.color_match import SKY_COLUMNS, changed_colors, changed_harmonics, match_photo
 from wildgs.model.config import WildGSConfig
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.sky import Sky, find_sky
 from wildgs.rasterize import Projection, Rendering, blend
 
+TILE = 16
+"""Pixels along a side of what the rasteriser leaves out of a sample."""
+MATCH_TILES = 80
+"""Tiles of a training picture that are rendered for its match, at least, where there are as many."""
 FIT_SIDE = 320
 """Pixels along the long side, at most, at which an encoded photo is matched: light is of low frequency."""
 
@@ -74,11 +78,6 @@ class Picture:
     codes: Float[Tensor, "H W L"]
     sky: Sky | None
 
-    def changed(self, change: Float[Tensor, "3 M"]) -> Rendering:
-        """The rendering with its colours changed."""
-        colors = changed_picture(self.rendering.colors, change, self.sky, self.codes)
-        return replace(self.rendering, colors=colors)
-
 
 class PhotoMatch(nn.Module):
     """Finds and applies changes of colours.
@@ -117,17 +116,31 @@ class PhotoMatch(nn.Module):
         """What is sky among points of a scene with this centre; None where there is none."""
         return find_sky(self.config.sky, points.detach(), centre)
 
+    @torch.no_grad()
     def picture(
         self,
         projection: Projection,
         colors: Float[Tensor, "N 3"],
-        intrinsic: Float[Tensor, "N I"],
+        codes: Float[Tensor, "N L"],
         centre: Float[Tensor, " 3"],
+        *,
+        training: bool = False,
     ) -> Picture:
-        """Renders colours and light codes of the Gaussians, and finds the sky; gradients flow to the first two."""
-        blended = blend(projection, torch.cat([colors, self.light_codes(intrinsic)], dim=1))
+        """Renders colours and light codes of the Gaussians, and finds the sky.
+
+        Args:
+            projection: Of the Gaussians.
+            colors: Theirs.
+            codes: Theirs.
+            centre: Of the scene.
+            training: Whether a sample of the tiles is enough.
+        """
+        camera = projection.camera
+        tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+        step = max(1, tiles // MATCH_TILES) if training else 1
+        blended = blend(projection, torch.cat([colors, codes], dim=1), tile_step=step)
         rendering = replace(blended, colors=blended.colors[..., :3])
-        sky = self.sky(projection.camera.unproject(blended.depth.detach()), centre)
+        sky = self.sky(camera.unproject(blended.depth), centre)
         return Picture(rendering, blended.colors[..., 3:], sky)
 
     def find(self, sight: Sight, picture: Picture, *, training: bool = False) -> Float[Tensor, "3 M"]:
@@ -148,6 +161,17 @@ class PhotoMatch(nn.Module):
             codes=picture.codes,
             training=training,
         )
+
+    def changed(
+        self,
+        colors: Float[Tensor, "N 3"],
+        change: Float[Tensor, "3 M"],
+        means: Float[Tensor, "N 3"],
+        codes: Float[Tensor, "N L"],
+        centre: Float[Tensor, " 3"],
+    ) -> Float[Tensor, "N 3"]:
+        """Changed colours of Gaussians; gradients flow to colours and codes."""
+        return changed_colors(colors, change, self.sky(means, centre), codes)
 
     def harmonics(
         self,

@@ -21,12 +21,14 @@ class Stage:
         learn_mask: Whether the visibility mask takes gradients now.
         sh_degree: Active degree of the spherical harmonics.
         learn_encoder: Whether the photo's encoder takes gradients now.
+        learn_planes: Whether the triplane's UNet takes gradients now.
     """
 
     explicit: bool = True
     learn_mask: bool = True
     sh_degree: int = 3
     learn_encoder: bool = True
+    learn_planes: bool = True
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from wildgs.model.initial import InitialGaussians
 from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
-from wildgs.model.photo_match import PhotoMatch, Picture, Sight
+from wildgs.model.photo_match import PhotoMatch, Sight
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
@@ -176,11 +176,18 @@ class WildGS(Method):
         sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
         with torch.no_grad():
             colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
-            change = self.photo_match.find(sight, self._picture(sight.projection, colors))
+            codes = self.photo_match.light_codes(self.gaussians.rows["intrinsic"])
+            picture = self.photo_match.picture(sight.projection, colors, codes, self._centre)
+            change = self.photo_match.find(sight, picture)
         return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
 
-    def _picture(self, projection: Projection, colors: Float[Tensor, "N 3"]) -> Picture:
-        return self.photo_match.picture(projection, colors, self.gaussians.rows["intrinsic"], self._centre)
+    def _matched(self, colors: Float[Tensor, "N 3"], sight: Sight) -> Float[Tensor, "N 3"]:
+        """Colours of the Gaussians in training, changed towards those of their photo."""
+        match, centre = self.photo_match, self._centre
+        codes = match.light_codes(self.gaussians.rows["intrinsic"])
+        picture = match.picture(sight.projection, colors.detach(), codes.detach(), centre, training=True)
+        change = self.config.matched_loss * match.find(sight, picture, training=True)
+        return match.changed(colors, change, self.gaussians.means, codes, centre)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -287,11 +294,11 @@ class WildGS(Method):
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
         if stage.explicit and not self._lacks("local"):
-            appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
-        colors = self.paint(projection, appearance, stage.sh_degree)
-        if not (self.config.color_match and self.config.matched_loss):
-            return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
-        picture = self._picture(projection, colors)
-        sight = Sight(photo, projection, appearance.visibility, keep)
-        change = self.config.matched_loss * self.photo_match.find(sight, picture, training=True)
-        return TrainingOutput(picture.changed(change), projection, appearance.visibility)
+            with torch.set_grad_enabled(torch.is_grad_enabled() and stage.learn_planes):
+                appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
+        matched = bool(self.config.color_match and self.config.matched_loss)
+        colors = self.paint(projection, appearance, stage.sh_degree, clamped=not matched)
+        if matched:
+            sight = Sight(photo, projection, appearance.visibility, keep)
+            colors = self._matched(colors, sight).clamp_min(0)
+        return TrainingOutput(blend(projection, colors), projection, appearance.visibility)

@@ -84,22 +84,30 @@ def _rank_values(tiles: TileLists, depths: Tensor, colors: Tensor) -> np.ndarray
 
 
 def _blend_pictures(
-    projection: Projection, colors: Tensor, background: Tensor, with_depth: bool, bookkeeping: bool
+    projection: Projection,
+    colors: Tensor,
+    background: Tensor,
+    with_depth: bool,
+    bookkeeping: bool,
+    order: np.ndarray | None = None,
 ) -> Any:
     """Runs the forward kernel; gives colours, depth, alpha, final transmittance and last positions."""
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
     channels = colors.shape[1]
+    order = tiles.tile_order if order is None else order
+    # Tiles that are left out are not written.
+    allocate = torch.empty if len(order) == len(tiles.tile_order) else torch.zeros
     values = _rank_values(tiles, projection.depths, colors)
-    out_colors = torch.empty(height, width, channels)
-    out_depth = torch.empty(height, width) if with_depth else torch.zeros(())
-    out_alpha = torch.empty(height, width)
+    out_colors = allocate(height, width, channels)
+    out_depth = allocate(height, width) if with_depth else torch.zeros(())
+    out_alpha = allocate(height, width)
     size = (tiles.offsets.size - 1) * TILE * TILE
     transmittance = np.empty(size, np.float32) if bookkeeping else None
     last = np.empty(size, np.float32) if bookkeeping else None
     launch(
         forward_kernels.blend_forward,
-        tiles.tile_order, tiles.offsets, tiles.entries, tiles.records,
+        order, tiles.offsets, tiles.entries, tiles.records,
         values, channels, with_depth, flat(background),
         width, height, flat(out_colors), flat(out_depth), flat(out_alpha), transmittance, last,
     )  # fmt: skip
@@ -120,3 +128,22 @@ def blend(
     else:
         pictures = _blend_pictures(projection, colors, background, depth, bookkeeping=False)[:3]
     return Rendering(*pictures)  # type: ignore[misc]
+
+
+@torch.no_grad()
+def blend_sample(
+    projection: Projection,
+    colors: Float[Tensor, "N C"],
+    background: Float[Tensor, "C"] | None,
+    depth: bool,
+    step: int,
+) -> Rendering:
+    """Blends a random one of every `step` tiles, spread over the picture; alpha is 0 in the others."""
+    if background is None:
+        background = colors.new_zeros(colors.shape[1])
+    order: np.ndarray = projection.tiles.tile_order
+    columns = -(-projection.camera.width // TILE)
+    # Diagonals of tiles, which no row or column of the picture escapes.
+    diagonal = order // columns + order % columns + int(torch.randint(step, ()))
+    chosen = order[diagonal % step == 0]
+    return Rendering(*_blend_pictures(projection, colors, background, depth, False, chosen)[:3])
