@@ -135,7 +135,7 @@ def test_calls_pass_the_checks_of_the_installed_gsplat(
     means = torch.rand(N, 3)
     projection = project(means, torch.rand(N, 4), torch.rand(N, 3), torch.rand(N), CAMERA, backend="cuda")
     assert projection.radii.tolist() == [9] * N
-    colors = cuda.sh_to_colors(means, torch.rand(N, 4, 3), CAMERA, 1, projection.visible)
+    colors = cuda.sh_to_colors(means, torch.rand(N, 4, 3), CAMERA, 1, projection.visible, clamped=True)
     assert colors.tolist() == [[1.5] * 3] * N
     rendering = blend(projection, colors, background=background)
     assert rendering.colors.shape == (48, 64, 3)

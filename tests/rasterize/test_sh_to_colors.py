@@ -22,13 +22,14 @@ def inputs(dtype: torch.dtype, count: int = 700) -> tuple[torch.Tensor, torch.Te
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("partly", [False, True])
-def test_values_and_gradients_match_torch_in_float64(degree: int, partly: bool):
+@pytest.mark.parametrize(("partly", "clamped"), [(False, True), (True, True), (True, False)])
+def test_values_and_gradients_match_torch_in_float64(degree: int, partly: bool, clamped: bool):
     visible = torch.arange(700) % 3 > 0 if partly else None
     results = []
     for dtype in (torch.float32, torch.float64):
         means, sh = inputs(dtype)
-        colors = sh_to_colors(means, sh, camera(), degree=degree, visible=visible)
+        colors = sh_to_colors(means, sh, camera(), degree=degree, visible=visible, clamped=clamped)
+        assert bool((colors < 0).any()) == (degree > 0 and not clamped)
         colors.backward(torch.linspace(-1, 1, colors.numel(), dtype=dtype).reshape(colors.shape))
         results.append((colors.detach(), torch.zeros(()) if means.grad is None else means.grad, sh.grad))
     for value, truth in zip(*results, strict=True):

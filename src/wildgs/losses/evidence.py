@@ -113,9 +113,16 @@ def structural_correlation(
 
 def _box_mean(x: Float[Tensor, "B 1 H W"], radius: int) -> Float[Tensor, "B 1 H W"]:
     """Means over squares of ``2 radius + 1`` pixels around every pixel, cut off at the borders."""
-    side = 2 * radius + 1
-    x = functional.avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
-    return functional.avg_pool2d(x, (1, side), 1, (0, radius), count_include_pad=False)
+    return _line_mean(_line_mean(x, radius).mT, radius).mT
+
+
+def _line_mean(x: Float[Tensor, "*batch W"], radius: int) -> Float[Tensor, "*batch W"]:
+    """Means over ``2 radius + 1`` entries of a row around every one, from sums up to each."""
+    width = x.shape[-1]
+    sums = functional.pad(x.cumsum(dim=-1), (1, 0))
+    place = torch.arange(width, device=x.device)
+    low, high = (place - radius).clamp_min(0), (place + radius + 1).clamp_max(width)
+    return (sums[..., high] - sums[..., low]) / (high - low)
 
 
 @torch.no_grad()

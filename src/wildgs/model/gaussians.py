@@ -121,6 +121,13 @@ def take_rows(values: Float[Tensor, "N *rest"], rows: Int[Tensor, " V"]) -> Floa
     return _TakeRows.apply(values, rows)
 
 
+def spread_rows(
+    values: Float[Tensor, "V *rest"], rows: Int[Tensor, " V"], count: int
+) -> Float[Tensor, "N *rest"]:
+    """The reverse of `take_rows`: values at their Gaussians' places, zero for the others."""
+    return values.new_zeros(count, *values.shape[1:]).index_copy(0, rows, values)
+
+
 class _TakeRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, rows: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]

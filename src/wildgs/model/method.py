@@ -10,15 +10,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
-import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
-from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_values
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, mean_embeddings
 from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
-from wildgs.model.gaussians import Gaussians, rows_to_shade, take_rows
+from wildgs.model.gaussians import Gaussians, rows_to_shade, spread_rows, take_rows
 from wildgs.model.initial import InitialGaussians, initial_from_points
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
@@ -225,15 +223,22 @@ class Method(nn.Module, ABC):
             clamped: Whether colours below black become black, as they are shown. What is to be changed is better
                 seen as it is: a change acts on the harmonics.
         """
-        means = self.gaussians.means
         rows = rows_to_shade(projection.visible)
-        sh = self.shade(appearance, rows)
-        if clamped:
-            seen = sh_to_colors(take_rows(means, rows), sh, projection.camera, degree=sh_degree)
-        else:
-            towards = take_rows(means, rows) - projection.camera.position
-            seen = 0.5 + sh_values(sh[:, : num_sh_bases(sh_degree)], towards)
-        return torch.zeros_like(means).index_copy(0, rows, seen)
+        seen = self.paint_rows(rows, projection.camera, appearance, sh_degree, clamped=clamped)
+        return spread_rows(seen, rows, self.num_gaussians)
+
+    def paint_rows(
+        self,
+        rows: Int[Tensor, " V"],
+        camera: Camera,
+        appearance: Appearance,
+        sh_degree: int,
+        *,
+        clamped: bool = True,
+    ) -> Float[Tensor, "V 3"]:
+        """As `paint`, of some Gaussians alone."""
+        means = take_rows(self.gaussians.means, rows)
+        return sh_to_colors(means, self.shade(appearance, rows), camera, degree=sh_degree, clamped=clamped)
 
     def training_pass(
         self,

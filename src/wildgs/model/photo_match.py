@@ -21,7 +21,7 @@ from wildgs.rasterize import Projection, Rendering, blend
 
 TILE = 16
 """Pixels along a side of what the rasteriser leaves out of a sample."""
-MATCH_TILES = 80
+MATCH_TILES = 40
 """Tiles of a training picture that are rendered for its match, at least, where there are as many."""
 FIT_SIDE = 320
 """Pixels along the long side, at most, at which an encoded photo is matched: light is of low frequency."""

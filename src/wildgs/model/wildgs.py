@@ -15,7 +15,7 @@ from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
-from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, take_rows
+from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, rows_to_shade, spread_rows, take_rows
 from wildgs.model.initial import InitialGaussians
 from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
@@ -181,13 +181,21 @@ class WildGS(Method):
             change = self.photo_match.find(sight, picture)
         return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
 
-    def _matched(self, colors: Float[Tensor, "N 3"], sight: Sight) -> Float[Tensor, "N 3"]:
-        """Colours of the Gaussians in training, changed towards those of their photo."""
+    def _matched(
+        self, colors: Float[Tensor, "V 3"], rows: Int[Tensor, " V"], sight: Sight
+    ) -> Float[Tensor, "V 3"]:
+        """Colours of Gaussians in training, changed towards those of their photo."""
         match, centre = self.photo_match, self._centre
-        codes = match.light_codes(self.gaussians.rows["intrinsic"])
-        picture = match.picture(sight.projection, colors.detach(), codes.detach(), centre, training=True)
+        codes = match.light_codes(take_rows(self.gaussians.rows["intrinsic"], rows))
+        picture = match.picture(
+            sight.projection,
+            spread_rows(colors.detach(), rows, self.num_gaussians),
+            spread_rows(codes.detach(), rows, self.num_gaussians),
+            centre,
+            training=True,
+        )
         change = self.config.matched_loss * match.find(sight, picture, training=True)
-        return match.changed(colors, change, self.gaussians.means, codes, centre)
+        return match.changed(colors, change, self.gaussians.means.detach()[rows], codes, centre)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -296,9 +304,11 @@ class WildGS(Method):
         if stage.explicit and not self._lacks("local"):
             with torch.set_grad_enabled(torch.is_grad_enabled() and stage.learn_planes):
                 appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
+        rows = rows_to_shade(projection.visible)
         matched = bool(self.config.color_match and self.config.matched_loss)
-        colors = self.paint(projection, appearance, stage.sh_degree, clamped=not matched)
+        colors = self.paint_rows(rows, camera, appearance, stage.sh_degree, clamped=not matched)
         if matched:
             sight = Sight(photo, projection, appearance.visibility, keep)
-            colors = self._matched(colors, sight).clamp_min(0)
+            colors = self._matched(colors, rows, sight).clamp_min(0)
+        colors = spread_rows(colors, rows, self.num_gaussians)
         return TrainingOutput(blend(projection, colors), projection, appearance.visibility)

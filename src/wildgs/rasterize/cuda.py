@@ -142,8 +142,11 @@ def sh_to_colors(
     camera: Camera,
     degree: int,
     visible: Bool[Tensor, "N"] | None,
+    clamped: bool,
 ) -> Float[Tensor, "N 3"]:
     """See `wildgs.rasterize.sh_to_colors`."""
     directions = means - camera.position.to(means)
-    colors = (load_gsplat().spherical_harmonics(degree, directions, sh, masks=visible) + 0.5).clamp(min=0)
+    colors = load_gsplat().spherical_harmonics(degree, directions, sh, masks=visible) + 0.5
+    if clamped:
+        colors = colors.clamp(min=0)
     return colors if visible is None else torch.where(visible[:, None], colors, 0)

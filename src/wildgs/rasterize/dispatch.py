@@ -140,6 +140,7 @@ def sh_to_colors(
     *,
     degree: int,
     visible: Bool[Tensor, "N"] | None = None,
+    clamped: bool = True,
 ) -> Float[Tensor, "N 3"]:
     """Colours of Gaussians as a camera sees them: max(0, spherical harmonics + 0.5), as in 3DGS and gsplat.
 
@@ -149,6 +150,7 @@ def sh_to_colors(
         camera: The camera.
         degree: 0 to 3.
         visible: Others get colour 0 and no gradient (`Projection.visible`); None computes all.
+        clamped: Whether colours below black become black; False leaves out the max(0, …).
 
     Raises:
         ValueError: Shapes or number types do not fit, or the degree is not supported.
@@ -163,7 +165,7 @@ def sh_to_colors(
         raise ValueError(f"sh has {sh.shape[1]} coefficients per channel, degree {degree} needs {bases}")
     if visible is not None and visible.shape != means.shape[:1]:
         raise ValueError(f"visible has shape {list(visible.shape)}, expected [{len(means)}]")
-    return _module(backend).sh_to_colors(means, sh, camera, degree, visible)
+    return _module(backend).sh_to_colors(means, sh, camera, degree, visible, clamped)
 
 
 def rasterize(

@@ -151,8 +151,11 @@ def sh_to_colors(
     camera: Camera,
     degree: int,
     visible: Tensor | None,
+    clamped: bool,
 ) -> Float[Tensor, "N 3"]:
     """See `wildgs.rasterize.sh_to_colors`."""
     bases = sh_basis(degree, normalize(means - camera.position.to(means), dim=-1))
-    colors = (torch.einsum("nk,nkc->nc", bases, sh[:, : num_sh_bases(degree)]) + 0.5).clamp(min=0)
+    colors = torch.einsum("nk,nkc->nc", bases, sh[:, : num_sh_bases(degree)]) + 0.5
+    if clamped:
+        colors = colors.clamp(min=0)
     return colors if visible is None else torch.where(visible[:, None], colors, 0)

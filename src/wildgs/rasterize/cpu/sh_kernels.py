@@ -77,8 +77,8 @@ def basis_gradient(degree, x, y, z, v):
 
 
 @njit(nogil=True)
-def shade_forward(counter, means, sh, bases, degree, eye, visible, out):
-    """Colours max(0, SH(direction) + 0.5) of the visible Gaussians; 0 for the others."""
+def shade_forward(counter, means, sh, bases, degree, eye, visible, floor, out):
+    """Colours max(floor, SH(direction) + 0.5) of the visible Gaussians; 0 for the others."""
     n = visible.size
     used = (degree + 1) * (degree + 1)
     values = np.empty(16, np.float32)
@@ -87,7 +87,7 @@ def shade_forward(counter, means, sh, bases, degree, eye, visible, out):
         if first >= n:
             break
         for g in range(first, min(first + CHUNK, n)):
-            red = green = blue = F(0.0)
+            red = green = blue = max(floor, F(0.0))
             if visible[g]:
                 x, y, z = (means[3 * g] - eye[0], means[3 * g + 1] - eye[1], means[3 * g + 2] - eye[2])
                 shrink = F(1.0) / max(math.sqrt(x * x + y * y + z * z), F(1e-12))
@@ -99,14 +99,14 @@ def shade_forward(counter, means, sh, bases, degree, eye, visible, out):
                     green += values[k] * sh[at + 3 * k + 1]
                     blue += values[k] * sh[at + 3 * k + 2]
             out[3 * g], out[3 * g + 1], out[3 * g + 2] = (
-                max(red, F(0.0)),
-                max(green, F(0.0)),
-                max(blue, F(0.0)),
+                max(red, floor),
+                max(green, floor),
+                max(blue, floor),
             )
 
 
 @njit(nogil=True)
-def shade_backward(counter, means, sh, bases, degree, eye, visible, out, v_out, v_sh, v_means):
+def shade_backward(counter, means, sh, bases, degree, eye, visible, floor, out, v_out, v_sh, v_means):
     """Gradients of the coefficients and (where `v_means` is no None) of the means."""
     n = visible.size
     used = (degree + 1) * (degree + 1)
@@ -118,9 +118,9 @@ def shade_backward(counter, means, sh, bases, degree, eye, visible, out, v_out, 
             break
         for g in range(first, min(first + CHUNK, n)):
             at = g * bases * 3
-            red = v_out[3 * g] if out[3 * g] > 0.0 else F(0.0)
-            green = v_out[3 * g + 1] if out[3 * g + 1] > 0.0 else F(0.0)
-            blue = v_out[3 * g + 2] if out[3 * g + 2] > 0.0 else F(0.0)
+            red = v_out[3 * g] if out[3 * g] > floor else F(0.0)
+            green = v_out[3 * g + 1] if out[3 * g + 1] > floor else F(0.0)
+            blue = v_out[3 * g + 2] if out[3 * g + 2] > floor else F(0.0)
             if not visible[g] or (red == 0.0 and green == 0.0 and blue == 0.0):
                 for k in range(3 * bases):
                     v_sh[at + k] = 0.0
