@@ -66,3 +66,19 @@ def test_the_embedding_drives_the_transform() -> None:
     changed = fusion(embedding, local, intrinsic) - fusion(0 * embedding, local, intrinsic)
     assert float(changed.detach()[:, 0].abs().min()) > 0
     assert Fusion(FusionConfig(color_transform=False), 16, 16).transform is None
+
+
+def test_an_embedding_that_all_share_counts_as_one_for_each() -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(), 16, 16)
+    common, _, intrinsic = inputs(fusion, torch.rand(40, 3))
+    results = []
+    for repeated in (False, True):
+        shared = torch.linspace(-1, 1, 16).requires_grad_()
+        local = shared.repeat(40, 1) if repeated else shared.expand(40, -1)
+        sh = fusion(common, local, intrinsic)
+        fusion.zero_grad()
+        sh.square().sum().backward()
+        results.append((sh.detach(), shared.grad, fusion.first_rows.weight.grad.clone()))
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)

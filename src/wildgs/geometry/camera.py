@@ -65,9 +65,16 @@ class Camera:
         pixels = seen @ self.K.T
         return pixels[:, :2] / pixels[:, 2:], seen[:, 2]
 
-    def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
-        """World coordinates of all pixel centres at depths along z (not along the ray), world units."""
-        rays = self.pixel_rays()
+    def unproject(
+        self, depth: Float[Tensor, "h w"], pixels: tuple[slice, slice] = (slice(None), slice(None))
+    ) -> Float[Tensor, "h w 3"]:
+        """World coordinates of pixel centres at depths along z (not along the ray), world units.
+
+        Args:
+            depth: Of the pixels.
+            pixels: Rows and columns that `depth` has; by default all.
+        """
+        rays = self.pixel_rays()[pixels]
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
         return (rays * depth[..., None] - translation) @ rotation
 

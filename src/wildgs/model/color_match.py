@@ -24,8 +24,6 @@ OUTLIER = 0.05
 """Residual at which a pixel counts half (Cauchy's weights): passers-by that the mask has missed."""
 LEAST_PIXELS = 64
 """Fewer say nothing about a photo's light."""
-MATCH_EVERY = 3
-"""Rows and columns of which one is read in training."""
 
 ELEVATION_ORDERS = 2
 """Powers of the sine of the elevation by which the sky's colours are matched: it is paler near the horizon."""
@@ -106,7 +104,7 @@ def match_photo(
         threshold: Th: pixels with a visibility above it are static.
         sky: Which pixels show it; None matches all pixels alike.
         codes: Rendered light codes of the landmark, on which its change depends linearly; L may be 0.
-        training: Reads every third row and column, and gives each channel a gain of its own, no more.
+        training: Gives each channel a gain of its own, no more.
 
     Returns:
         As `match_colors`, [A | b | W]; with a sky, that of `match_sky` beside it.
@@ -116,13 +114,11 @@ def match_photo(
     if keep is not None:
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
-    every = MATCH_EVERY if training else 1
-    some = tuple(slice(min(every // 2, side - 1), None, every) for side in photo.shape[:2])
-    colors, photo, weights = rendering.colors[some], photo[some], weights[some]
+    colors = rendering.colors
     if sky is None:
-        return match_colors(colors, photo, weights, training, codes[some])
-    own = match_colors(colors, photo, weights * ~sky.which[some], training, codes[some])
-    of_sky = match_sky(colors, photo, (covered & sky.which)[some].float(), sky.sine[some], training)
+        return match_colors(colors, photo, weights, training, codes)
+    own = match_colors(colors, photo, weights * ~sky.which, training, codes)
+    of_sky = match_sky(colors, photo, (covered & sky.which).float(), sky.sine, training)
     return torch.cat([own, of_sky], dim=1)
 
 

@@ -110,18 +110,34 @@ class Fusion(MixedModule):
             intrinsic: f^in.
             color_map: A further change [A | b] of all colours, after the colour transform.
         """
-        # In the precision of the product that reads them: to join them first would cost a copy of both in full.
-        rows = torch.cat([local_embeddings.to(self.precision), intrinsic.to(self.precision)], dim=1)
         output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
-        with self.mixed(rows.device):
-            of_all = self.first_global(global_embedding)
-            hidden = linear_over_rows(rows, self.first_rows.weight, of_all).relu_()
+        with self.mixed(intrinsic.device):
+            hidden = self._first_layer(global_embedding, local_embeddings, intrinsic).relu_()
             hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
             fused = linear_over_rows(hidden, output, bias)
         fused = fused.float()
         if direct is not None:  # it carries the base colour and stays in full precision
             fused = torch.addmm(fused, intrinsic, direct.T)
         return fused.reshape(-1, self.coefficients, 3)
+
+    def _first_layer(
+        self,
+        global_embedding: Float[Tensor, " G"],
+        local_embeddings: Float[Tensor, "N L"],
+        intrinsic: Float[Tensor, "N I"],
+    ) -> Float[Tensor, "N H"]:
+        """Before its rectifier."""
+        of_all, weight = self.first_global(global_embedding), self.first_rows.weight
+        intrinsic = intrinsic.to(self.precision)
+        if (
+            local_embeddings.stride(0) == 0 and len(local_embeddings) > 1
+        ):  # v, expanded: the same for all as well
+            local = local_embeddings.shape[1]
+            of_all = of_all + functional.linear(local_embeddings[0], weight[:, :local])
+            return linear_over_rows(intrinsic, weight[:, local:], of_all)
+        # In the precision of the product that reads them: to join them first would cost a copy of both in full.
+        rows = torch.cat([local_embeddings.to(self.precision), intrinsic], dim=1)
+        return linear_over_rows(rows, weight, of_all)
 
     def _change(
         self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None

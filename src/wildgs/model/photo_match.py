@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,6 +21,8 @@ from wildgs.rasterize import Projection, Rendering, blend
 
 TILE = 16
 """Pixels along a side of what the rasteriser leaves out of a sample."""
+MATCH_EVERY = 3
+"""Rows and columns of which one is read in training, where there are as many."""
 MATCH_TILES = 40
 """Tiles of a training picture that are rendered for its match, at least, where there are as many."""
 FIT_SIDE = 320
@@ -72,11 +74,13 @@ class Picture:
         rendering: Colours, depth and alpha.
         codes: The light codes in its pixels.
         sky: Which pixels show the sky; None for a scene without one.
+        pixels: Rows and columns of the photo that are there.
     """
 
     rendering: Rendering
     codes: Float[Tensor, "H W L"]
     sky: Sky | None
+    pixels: tuple[slice, slice]
 
 
 class PhotoMatch(nn.Module):
@@ -133,15 +137,18 @@ class PhotoMatch(nn.Module):
             colors: Theirs.
             codes: Theirs.
             centre: Of the scene.
-            training: Whether a sample of the tiles is enough.
+            training: Whether a sample is enough: of the tiles, and of their rows and columns.
         """
         camera = projection.camera
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
         step = max(1, tiles // MATCH_TILES) if training else 1
         blended = blend(projection, torch.cat([colors, codes], dim=1), tile_step=step)
-        rendering = replace(blended, colors=blended.colors[..., :3])
-        sky = self.sky(camera.unproject(blended.depth), centre)
-        return Picture(rendering, blended.colors[..., 3:], sky)
+        every = MATCH_EVERY if training else 1
+        rows, columns = (slice(min(every // 2, side - 1), None, every) for side in blended.alpha.shape)
+        pixels = (rows, columns)
+        colors, depth = blended.colors[pixels], blended.depth[pixels]
+        sky = self.sky(camera.unproject(depth, pixels), centre)
+        return Picture(Rendering(colors[..., :3], depth, blended.alpha[pixels]), colors[..., 3:], sky, pixels)
 
     def find(self, sight: Sight, picture: Picture, *, training: bool = False) -> Float[Tensor, "3 M"]:
         """The change that takes the colours of a picture to those of the photo, without gradient.
@@ -149,13 +156,14 @@ class PhotoMatch(nn.Module):
         Args:
             sight: The photo.
             picture: From its camera.
-            training: Fewer pixels, and a gain for each channel; see `match_photo`.
+            training: Whether each channel has a gain of its own; see `match_photo`.
         """
+        pixels = picture.pixels
         return match_photo(
-            sight.photo,
+            sight.photo[pixels],
             picture.rendering,
-            sight.visibility,
-            sight.keep,
+            None if sight.visibility is None else sight.visibility[pixels],
+            None if sight.keep is None else sight.keep[pixels],
             threshold=self.config.mask_threshold,
             sky=picture.sky,
             codes=picture.codes,
