@@ -82,10 +82,12 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     model, train = plain["model"], plain["train"]
     for name in ("matched_loss", "light_codes", "light_components"):
         assert model.pop(name) > 0
+    assert model.pop("local_embeddings") is False
     assert model["sky"].pop("densify") is False
     assert train["optimizer"].pop("short_runs") > 0
     config = from_plain(RunConfig, plain)
     assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
+    assert config.model.local_embeddings
     assert config.model.sky.densify
     assert config.train.optimizer.short_runs == 0
     assert from_plain(RunConfig, to_plain(BASE)) == BASE

@@ -18,6 +18,7 @@ def test_default_changes_nothing() -> None:
 
 MENDED = {
     "model.parsing.encoder": "microsoft/resnet-18",
+    "model.local_embeddings": True,
     "model.wrapping.resolution": 128,
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,

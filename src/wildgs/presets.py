@@ -28,6 +28,7 @@ class Preset:
 
 _PAPER: dict[str, Any] = {
     "model.parsing.encoder": RESNET18,
+    "model.local_embeddings": True,
     "model.wrapping.resolution": 128,
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,

@@ -30,11 +30,13 @@ def test_densification_can_be_switched_off() -> None:
     assert any(without_resets.densifies(s) for s in range(3000))
 
 
-@pytest.mark.parametrize("name", ["densify_every", "reset_every", "first_stage", "sh_every", "encoder_every"])
+@pytest.mark.parametrize(
+    "name", ["densify_every", "reset_every", "first_stage", "sh_every", "encoder_every", "mask_every"]
+)
 def test_impossible_steps_are_one_line(name: str) -> None:
     with pytest.raises(UserError, match=rf"schedule\.{name} -1: must be"):
         ScheduleConfig(**{name: -1})
-    if name in ("sh_every", "encoder_every"):
+    if name in ("sh_every", "encoder_every", "mask_every"):
         with pytest.raises(UserError, match="must be 1 or more"):
             ScheduleConfig(**{name: 0})
 
@@ -93,3 +95,13 @@ def test_the_encoder_learns_as_often_however_many_photos_a_step_has(ranks: int) 
     steps = range(0, 240, ranks)
     learning = {step for step in steps if schedule.stage(step, 3, ranks).learn_encoder}
     assert learning == {step for step in steps if any(photo % 4 == 0 for photo in range(step, step + ranks))}
+
+
+def test_mask_and_planes_take_turns() -> None:
+    schedule = Schedule(ScheduleConfig(reset_every=0), 30_000)
+    stages = [schedule.stage(step, 3) for step in range(10)]
+    assert [stage.learn_mask for stage in stages] == [True, False] * 5
+    assert [stage.learn_planes for stage in stages] == [False, True] * 5
+    both = Schedule(ScheduleConfig(mask_every=1, planes_every=1, reset_every=0), 30_000).stage(3, 3)
+    assert both.learn_mask
+    assert both.learn_planes

@@ -43,6 +43,10 @@ def trainer_for(method: MethodName, team: Team, schedule: ScheduleConfig) -> Tra
     return Trainer(made, scene, config, team)
 
 
+EVERY_STEP = ScheduleConfig(first_stage=0, mask_every=1, planes_every=1)
+"""All parts learn on all steps."""
+
+
 def found_in(trainer: Trainer, losses: list[Losses]) -> dict:
     return {
         "gradients": {n: p.grad for n, p in trainer.method.named_parameters() if p.grad is not None},
@@ -54,14 +58,14 @@ def found_in(trainer: Trainer, losses: list[Losses]) -> dict:
 def first_gradients(output: Path, team: Team) -> None:
     """Both photos in two processes, and both in one, all parts of the method on."""
     for method in METHODS:
-        together = trainer_for(method, team, ScheduleConfig(first_stage=0))
+        together = trainer_for(method, team, EVERY_STEP)
         together.begin()
         rendered, losses = together._forward(together.feed.next_view())
         losses.total.backward()
         mean = team.average(together.method.parameters(), losses)
         together.density.gather(rendered.projection, team.pool)
 
-        alone = trainer_for(method, Team(), ScheduleConfig(first_stage=0))
+        alone = trainer_for(method, Team(), EVERY_STEP)
         alone.begin()
         both = []
         for index in alone.sampler.take(2):

@@ -45,7 +45,9 @@ def wall() -> Scene:
 def _make(scene: Scene, seed: int) -> WildGS:
     torch.manual_seed(seed)
     config = WildGSConfig(
-        parsing=ParsingConfig(max_side=32), wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8))
+        local_embeddings=True,
+        parsing=ParsingConfig(max_side=32),
+        wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)),
     )
     model = WildGS.from_points(config, scene.points, scene.point_colors, encoder=load_encoder(None))
     with torch.no_grad():

@@ -36,6 +36,7 @@ def make_wall_model(wall: torch.Tensor):
     def make(*without: Ablation, **config: object) -> WildGS:
         torch.manual_seed(0)
         settings = WildGSConfig(
+            local_embeddings=True,
             sky=SkyConfig(points=0),
             fusion=FusionConfig(sh_degree=3),
             without=without,

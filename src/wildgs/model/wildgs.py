@@ -75,7 +75,8 @@ class WildGS(Method):
         model = cls(config, Gaussians(initial.rows | {"intrinsic": intrinsic}), box, encoder)
         with torch.no_grad():
             model.gaussians.rows["intrinsic"].copy_(model.fusion.initial_intrinsic(initial.colors))
-        model.wrapping.calibrate(initial.points, initial.point_colors)
+        if config.local_embeddings:
+            model.wrapping.calibrate(initial.points, initial.point_colors)
         return model
 
     @classmethod
@@ -128,6 +129,10 @@ class WildGS(Method):
         """Components of the basis of lights."""
         return 0 if self.light_basis.components is None else len(self.light_basis.components)
 
+    @property
+    def _wraps(self) -> bool:
+        return self.config.local_embeddings and not self._lacks("local")
+
     def _lacks(self, part: Ablation) -> bool:
         return part in self.config.without
 
@@ -168,7 +173,7 @@ class WildGS(Method):
             appearance = replace(appearance, visibility=None)
         with torch.no_grad():
             projection = self.gaussians.project(camera)
-        if not self._lacks("local"):
+        if self._wraps:
             appearance = self.wrap(photo, appearance, projection, keep)
         # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
         if not (self.config.color_match and trust_mask):
@@ -301,7 +306,7 @@ class WildGS(Method):
         )
         projection = self.gaussians.project(camera)
         projection.means2d.retain_grad()
-        if stage.explicit and not self._lacks("local"):
+        if stage.explicit and self._wraps:
             with torch.set_grad_enabled(torch.is_grad_enabled() and stage.learn_planes):
                 appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
         rows = rows_to_shade(projection.visible)
