@@ -11,7 +11,6 @@ from wildgs.geometry.spherical_harmonics import C0
 from wildgs.model.color_match import (
     LEAST_PIXELS,
     SKY_COLUMNS,
-    changed_colors,
     changed_harmonics,
     elevation_powers,
     mapped,
@@ -34,6 +33,20 @@ def test_finds_the_map_that_made_the_photo(seed: int) -> None:
     photo = changed(render, change)
     found = match_colors(render, photo, torch.ones(24, 30))
     torch.testing.assert_close(changed(render, found), photo, atol=0.01, rtol=0)
+
+
+def changed_colors(
+    colors: torch.Tensor, change: torch.Tensor, sky: Sky | None, codes: torch.Tensor
+) -> torch.Tensor:
+    """A picture's colours changed pixel by pixel."""
+    own, by_code, of_sky, by_elevation = change.tensor_split(
+        (4, 4 + codes.shape[-1], 8 + codes.shape[-1]), dim=1
+    )
+    below = changed(colors, own) + codes @ by_code.T
+    if sky is None:
+        return below
+    above = changed(colors, of_sky) + elevation_powers(sky.sine) @ by_elevation.T
+    return torch.where(sky.which[..., None], above, below)
 
 
 def test_weights_of_zero_are_not_looked_at() -> None:

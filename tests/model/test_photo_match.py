@@ -7,6 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from wildgs.geometry.spherical_harmonics import C0
+from wildgs.model.config import SkyConfig, WildGSConfig
 from wildgs.model.method import Stage
 from wildgs.model.photo_match import PhotoMatch
 from wildgs.model.registry import restore_method
@@ -72,3 +74,18 @@ def test_scenes_below_black_are_matched(camera, make_wall_model, value: float) -
         photo = grey_photo(camera, 0.7)
         rendered = model.render(camera, model.shade(model.encode(photo, camera))).colors[8:-8, 8:-8]
     torch.testing.assert_close(rendered, photo[8:-8, 8:-8], atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize("points", [0, 60])
+@pytest.mark.parametrize("light_codes", [0, 3])
+def test_colours_change_in_training_as_harmonics_do(points: int, light_codes: int) -> None:
+    torch.manual_seed(0)
+    match = PhotoMatch(WildGSConfig(light_codes=light_codes, sky=SkyConfig(points=points, radius=10.0)))
+    change = 0.2 * torch.randn(3, match.columns)
+    for first in (0, 4 + light_codes):  # in training, channels do not mix
+        change[:, first : first + 3] = change[:, first : first + 3].diagonal().diag()
+    means, centre = torch.randn(50, 3) * torch.linspace(0.1, 20, 50)[:, None], torch.zeros(3)
+    colors, intrinsic = torch.rand(50, 3), torch.randn(50, 32)
+    harmonics = ((colors - 0.5) / C0)[:, None]
+    expected = 0.5 + C0 * match.harmonics(harmonics, change, means, intrinsic, centre)[:, 0]
+    torch.testing.assert_close(match.changed(colors, change, means, intrinsic, centre), expected)

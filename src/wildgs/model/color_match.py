@@ -136,7 +136,7 @@ def changed_harmonics(
         sky: Which Gaussians stand for it; None as in `match_photo`.
         codes: Their light codes.
     """
-    own, by_code, of_sky, by_elevation = _split(change, codes.shape[1])
+    own, by_code, of_sky, by_elevation = split_change(change, codes.shape[1])
     below = mapped(harmonics, own, codes @ by_code.T)
     if sky is None:
         return below
@@ -144,22 +144,7 @@ def changed_harmonics(
     return torch.where(sky.which[:, None, None], above, below)
 
 
-def changed_colors(
-    colors: Float[Tensor, "*batch 3"],
-    change: Float[Tensor, "3 M"],
-    sky: Sky | None,
-    codes: Float[Tensor, "*batch L"],
-) -> Float[Tensor, "*batch 3"]:
-    """Colours of Gaussians or of pixels, changed; see `changed_harmonics`."""
-    own, by_code, of_sky, by_elevation = _split(change, codes.shape[-1])
-    below = colors + colors @ own[:, :3].T + own[:, 3] + codes @ by_code.T
-    if sky is None:
-        return below
-    above = colors + colors @ of_sky[:, :3].T + of_sky[:, 3] + elevation_powers(sky.sine) @ by_elevation.T
-    return torch.where(sky.which[..., None], above, below)
-
-
-def _split(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
+def split_change(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
     """[A | b] of the landmark and what its codes change, the same of the sky and its elevation."""
     return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)
 

@@ -220,8 +220,8 @@ class WildGSConfig:
         without: Parts left out, for ablations.
         mask_threshold: Th: pixels above it are static (lifting, depth loss).
         parsing: 2D Parsing.
-        local_embeddings: Whether 3D Wrapping gives every Gaussian a local embedding of the photo. In the paper it does;
-            by default light codes carry what of the light varies over the scene.
+        local_embeddings: Whether 3D Wrapping gives every Gaussian a local embedding of the photo. In the paper it
+            does; by default light codes carry what of the light varies over the scene.
         wrapping: 3D Wrapping.
         fusion: The fusion network.
         depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.

@@ -13,7 +13,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.geometry.camera import Camera
-from wildgs.model.color_match import SKY_COLUMNS, changed_colors, changed_harmonics, match_photo
+from wildgs.model.color_match import (
+    SKY_COLUMNS,
+    changed_harmonics,
+    elevation_powers,
+    match_photo,
+    split_change,
+)
 from wildgs.model.config import WildGSConfig
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.sky import Sky, find_sky
@@ -124,8 +130,7 @@ class PhotoMatch(nn.Module):
     def picture(
         self,
         projection: Projection,
-        colors: Float[Tensor, "N 3"],
-        codes: Float[Tensor, "N L"],
+        values: Float[Tensor, "N C"],
         centre: Float[Tensor, " 3"],
         *,
         training: bool = False,
@@ -134,15 +139,14 @@ class PhotoMatch(nn.Module):
 
         Args:
             projection: Of the Gaussians.
-            colors: Theirs.
-            codes: Theirs.
+            values: Their colours and light codes, side by side.
             centre: Of the scene.
             training: Whether a sample is enough: of the tiles, and of their rows and columns.
         """
         camera = projection.camera
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
         step = max(1, tiles // MATCH_TILES) if training else 1
-        blended = blend(projection, torch.cat([colors, codes], dim=1), tile_step=step)
+        blended = blend(projection, values, tile_step=step)
         every = MATCH_EVERY if training else 1
         rows, columns = (slice(min(every // 2, side - 1), None, every) for side in blended.alpha.shape)
         pixels = (rows, columns)
@@ -172,14 +176,29 @@ class PhotoMatch(nn.Module):
 
     def changed(
         self,
-        colors: Float[Tensor, "N 3"],
+        colors: Float[Tensor, "V 3"],
         change: Float[Tensor, "3 M"],
-        means: Float[Tensor, "N 3"],
-        codes: Float[Tensor, "N L"],
+        means: Float[Tensor, "V 3"],
+        intrinsic: Float[Tensor, "V I"],
         centre: Float[Tensor, " 3"],
-    ) -> Float[Tensor, "N 3"]:
-        """Changed colours of Gaussians; gradients flow to colours and codes."""
-        return changed_colors(colors, change, self.sky(means, centre), codes)
+    ) -> Float[Tensor, "V 3"]:
+        """Colours of Gaussians under a change found in training, in which channels do not mix.
+
+        Gradients flow to colours, intrinsic features and codes. `harmonics` does the same to harmonics.
+        """
+        own, by_code, of_sky, by_elevation = split_change(change, self.num_codes)
+        gains, offsets = 1 + own[:, :3].diagonal(), own[:, 3].expand(len(colors), 3)
+        below: Tensor | float = 1.0
+        sky = self.sky(means, centre)
+        if sky is not None:
+            which = sky.which[:, None]
+            below = ~which
+            gains = torch.where(which, 1 + of_sky[:, :3].diagonal(), gains)
+            elevated = torch.addmm(of_sky[:, 3], elevation_powers(sky.sine), by_elevation.T)
+            offsets = torch.where(which, elevated, offsets)
+        if self.codes is not None:
+            offsets = offsets + below * (intrinsic @ (by_code @ self.codes.weight).T)
+        return torch.addcmul(offsets, colors, gains)
 
     def harmonics(
         self,

@@ -182,7 +182,8 @@ class WildGS(Method):
         with torch.no_grad():
             colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
             codes = self.photo_match.light_codes(self.gaussians.rows["intrinsic"])
-            picture = self.photo_match.picture(sight.projection, colors, codes, self._centre)
+            values = torch.cat([colors, codes], dim=1)
+            picture = self.photo_match.picture(sight.projection, values, self._centre)
             change = self.photo_match.find(sight, picture)
         return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
 
@@ -191,16 +192,14 @@ class WildGS(Method):
     ) -> Float[Tensor, "V 3"]:
         """Colours of Gaussians in training, changed towards those of their photo."""
         match, centre = self.photo_match, self._centre
-        codes = match.light_codes(take_rows(self.gaussians.rows["intrinsic"], rows))
-        picture = match.picture(
-            sight.projection,
-            spread_rows(colors.detach(), rows, self.num_gaussians),
-            spread_rows(codes.detach(), rows, self.num_gaussians),
-            centre,
-            training=True,
-        )
-        change = self.config.matched_loss * match.find(sight, picture, training=True)
-        return match.changed(colors, change, self.gaussians.means.detach()[rows], codes, centre)
+        intrinsic = take_rows(self.gaussians.rows["intrinsic"], rows)
+        with torch.no_grad():
+            values = torch.cat([colors, match.light_codes(intrinsic)], dim=1)
+            values = spread_rows(values, rows, self.num_gaussians)
+            picture = match.picture(sight.projection, values, centre, training=True)
+            change = self.config.matched_loss * match.find(sight, picture, training=True)
+            means = self.gaussians.means[rows]
+        return match.changed(colors, change, means, intrinsic, centre)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
