@@ -20,6 +20,7 @@ MENDED = {
     "model.parsing.encoder": "microsoft/resnet-18",
     "model.local_embeddings": True,
     "model.wrapping.resolution": 128,
+    "model.parsing.decoder_widths": [128, 64, 32],
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,
     "model.fusion.sh_degree": 3,

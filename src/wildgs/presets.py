@@ -30,6 +30,7 @@ _PAPER: dict[str, Any] = {
     "model.parsing.encoder": RESNET18,
     "model.local_embeddings": True,
     "model.wrapping.resolution": 128,
+    "model.parsing.decoder_widths": [128, 64, 32],
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,
     "model.fusion.sh_degree": 3,

@@ -49,7 +49,7 @@ class ParsingConfig:
     max_side: int = 256
     color_statistics: bool = True
     global_size: int = 16
-    decoder_widths: tuple[int, int, int] = (128, 64, 32)
+    decoder_widths: tuple[int, int, int] = (64, 32, 16)
     bounded_logits: bool = True
 
 
