@@ -44,6 +44,7 @@ def test_changes_what_it_names_and_nothing_else():
         ({"train.optimizer.means": 0}, "train.optimizer.means 0"),
         ({"train.objective.depth_weight": float("inf")}, "depth_weight inf"),
         ({"model.learning_rates.networks": -1}, "networks -1"),
+        ({"model.without": ["mask", "crop"]}, "without crop: .*--local-embeddings"),
     ],
 )
 def test_what_does_not_exist_or_fit_is_named(entries, said):

@@ -8,7 +8,7 @@ from typing import get_args
 
 import pytest
 
-from wildgs.config import RunConfig, differing_entries, write_config
+from wildgs.config import RunConfig, differing_entries, with_entries, write_config
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.published import PHOTOTOURISM, published_figures
 from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant
@@ -30,7 +30,7 @@ def test_every_ablation_is_a_method_with_a_label():
         "mine",
     ]
     for name in BENCH_METHODS:
-        config = method_config(name, BASE)
+        config = method_config(name, with_entries(BASE, {"model.local_embeddings": True}))
         assert config.method == (name if name in METHODS else "wildgs")
         if config.method == "wildgs":
             expected = (name.removeprefix("without-"),) if name.startswith("without-") else ()
@@ -151,7 +151,9 @@ def test_what_stands_beside_the_papers_figures_is_the_preset_paper(landmark: Pat
 
 
 def test_without_a_suite_ablations_are_those_of_the_default():
-    assert method_config("without-crop", BASE).model == replace(BASE.model, without=("crop",))
+    assert method_config("without-mask", BASE).model == replace(BASE.model, without=("mask",))
+    with pytest.raises(UserError, match="--local-embeddings"):
+        method_config("without-crop", BASE)
     assert {"paper", "wildgs"} <= set(default_bench_methods(None))
     assert "default" not in default_bench_methods(None)
 

@@ -253,6 +253,15 @@ class WildGSConfig:
     light_components: int = 32
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
+    def __post_init__(self) -> None:
+        """Refuses to leave out what is not there."""
+        absent = [part for part in ("local", "reverse", "crop") if part in self.without]
+        if absent and not self.local_embeddings:
+            raise UserError(
+                f"without {', '.join(absent)}: that is a part of 3D Wrapping, which is off; "
+                "use it with --local-embeddings or --preset paper"
+            )
+
 
 @dataclass(frozen=True)
 class VanillaRates:
