@@ -2,11 +2,12 @@
 
     python benchmarks/train_step.py                       100k and 1M Gaussians, 500x375 and 1000x750
     python benchmarks/train_step.py --quick               100k Gaussians, 480x360
+    python benchmarks/train_step.py --small               40k Gaussians, 240x180
     python benchmarks/train_step.py --eager               on CUDA: networks without graphs
     python benchmarks/train_step.py --json                a row a line, each as soon as it is measured
 
 The scene is the demo's landmark with its points multiplied to N; both methods start from the same points and
-train in turns, so that a noisy machine slows both alike. A step is the mean over as many as the encoder's rhythm
+train in turns, so that a noisy machine slows both alike. A step is the mean over as many as the mask's rhythm
 has (it learns on every second). Steps are of the second stage, all parts on, with the statistics of densification
 gathered and its rounds left out (they come once in a hundred steps and are timed for themselves). Times are
 medians over steps. Stages are timed in further steps that carry the clocks: a stage's backward time runs from the
@@ -207,7 +208,7 @@ def plain_steps(trainers: dict[MethodName, Trainer], count: int) -> dict[MethodN
     warm_up = 20 if on_cuda else min(2, count)  # until every shape of photo has its graph
     for index in range(count + warm_up):
         for name, trainer in trainers.items():
-            rhythm = trainer.config.schedule.encoder_every
+            rhythm = trainer.config.schedule.mask_every
             start = time.perf_counter()
             for _ in range(rhythm):
                 trainer.advance()
@@ -255,7 +256,7 @@ def measure(
     base = median(seconds["3dgs"])
     rows = []
     for name, trainer in trainers.items():
-        clock = stages_of(trainer, trainer.config.schedule.encoder_every * max(2, count // 4))
+        clock = stages_of(trainer, trainer.config.schedule.mask_every * max(2, count // 4))
         camera = scene.train_views[0].camera
         times = seconds[name]
         rows.append(
@@ -287,6 +288,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="100k Gaussians at 480x360 alone")
+    parser.add_argument(
+        "--small", action="store_true", help="40k Gaussians at 240x180 alone, as in docs/study.md"
+    )
     parser.add_argument("--json", action="store_true", help="a row a line, and nothing else, on stdout")
     parser.add_argument("--steps", type=int, default=12, help="timed steps a method")
     parser.add_argument("--n", type=int, help="this many Gaussians alone")
@@ -295,10 +299,12 @@ def main() -> None:
     parser.add_argument("--eager", action="store_true", help="on CUDA: networks without graphs")
     options = parser.parse_args()
     device = default_device()
-    sizes = ((480, 360),) if options.quick else SIZES
+    sizes = ((240, 180),) if options.small else ((480, 360),) if options.quick else SIZES
     if options.width:
         sizes = ((options.width, 0),)
-    counts = (options.n,) if options.n else (COUNTS[:1] if options.quick else COUNTS)
+    counts = (40_000,) if options.small else COUNTS[:1] if options.quick else COUNTS
+    if options.n:
+        counts = (options.n,)
     for width, _ in sizes:
         with tempfile.TemporaryDirectory() as folder:
             scene = make_scene(Path(folder) / "scene", width, options.photos)
