@@ -85,12 +85,12 @@ def _color_map_of_no_numbers(file: Path, look) -> None:
     ("spoil", "words"),
     [
         (lambda file, look: None, "no such file"),
-        (lambda file, look: file.write_bytes(b"PK no"), "no appearance file"),
-        (lambda file, look: save_file({"x": torch.zeros(2)}, file), "no appearance file"),
-        (_strange_tensors, "no appearance file"),
-        (_rows_out_of_range, "no appearance file"),
-        (_long_color_map, "no appearance file"),
-        (_color_map_of_no_numbers, "no appearance file"),
+        (lambda file, look: file.write_bytes(b"PK no"), "not an appearance file"),
+        (lambda file, look: save_file({"x": torch.zeros(2)}, file), "not an appearance file"),
+        (_strange_tensors, "not an appearance file"),
+        (_rows_out_of_range, "not an appearance file"),
+        (_long_color_map, "not an appearance file"),
+        (_color_map_of_no_numbers, "not an appearance file"),
     ],
 )
 def test_other_files_are_refused(method, look, tmp_path: Path, spoil, words) -> None:

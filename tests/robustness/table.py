@@ -45,7 +45,7 @@ _NOT_WRITTEN: dict[str, Cell] = {
     "read-only": ("error", "cannot be written", "error"),
     "full disk": ("error", "cannot be written .*free disk space", "error"),
 }
-_NO_APPEARANCE = ("error", "is no appearance file", "error")
+_NO_APPEARANCE = ("error", "not an appearance file", "error")
 _DAMAGED = ("left out", r"step_00000002\.safetensors is damaged", "the one before is used")
 
 TABLE: dict[str, dict[str, Cell]] = {

@@ -70,7 +70,7 @@ def load_look(method: Method, file: Path) -> Look:
         sky = Look(f"sky of {name}", _fitting(method, of_sky), method) if of_sky else None
         return Look(name, _fitting(method, tensors), method, sky=sky)
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(f"{file}: is no appearance file; `wildgs appearance` makes one") from error
+        raise UserError(f"{file}: not an appearance file; `wildgs appearance` writes them") from error
 
 
 def _packed(embeddings: Embeddings) -> dict[str, Tensor]:

@@ -17,7 +17,6 @@ def masked_photometric(
     weight_l1: float = 0.8,
     *,
     proven: Bool[Tensor, "H W"] | None = None,
-    sky: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, ""]:
     """``λ |I⊙M - Î⊙M| + (1 - λ) (1 - SSIM(I⊙M, Î⊙M))``, paper section 'Transient Objects Handling'.
 
@@ -27,7 +26,7 @@ def masked_photometric(
     The value is the formula's, and so is the gradient to the render. The gradient to the mask is not: through
     SSIM of two pictures that share a factor M, a mask lowers the loss by being textured itself, and learns the
     scene's edges instead of passers-by. Here hiding a pixel is worth its `transient_evidence`; showing it is worth
-    `PROOF` where it is static by proof; and where the scene shows nothing but sky there is no evidence.
+    `PROOF` where it is static by proof.
 
     Args:
         photo: The reference photo I, in 0..1.
@@ -35,7 +34,6 @@ def masked_photometric(
         visibility: M, 1 where the photo shows the static scene; None stands for 1 everywhere.
         weight_l1: λ.
         proven: Pixels that are static by proof (`proven_static`); None for none.
-        sky: Pixels at which the scene shows sky, whose colours change most with the light; None for none.
 
     Returns:
         The loss.
@@ -47,8 +45,6 @@ def masked_photometric(
     if visibility.requires_grad:
         # Adds nothing to the value, and the evidence to the mask's gradient.
         evidence = transient_evidence(photo, render.detach())
-        if sky is not None:
-            evidence = torch.where(sky, 0.0, evidence)
         if proven is not None:
             evidence = torch.where(proven, -PROOF, evidence)
         loss = loss + ((visibility - fixed) * evidence).mean()

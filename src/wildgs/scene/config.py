@@ -59,5 +59,5 @@ def parse_bytes(text: str) -> int:
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     if match is None or match[2].upper() not in _UNITS:
-        raise UserError(f"{text!r} is no size; write it as 4GB, 500MB or 2GiB")
+        raise UserError(f"{text!r} is not a size; write it as 4GB, 500MB or 2GiB")
     return int(float(match[1]) * _UNITS[match[2].upper()])

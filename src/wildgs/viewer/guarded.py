@@ -61,7 +61,7 @@ class GuardedServer(viser.ViserServer):
         if not taken:
             self.stop()
             raise UserError(
-                f"viser {viser.__version__} has another server inside than Wild-GS knows how to protect: "
+                f"viser {viser.__version__} cannot be protected: its server differs from the versions that Wild-GS supports; "
                 "pip install 'viser>=1.1,<1.2'"
             )
 
