@@ -133,7 +133,7 @@ class Fusion(MixedModule):
             local_embeddings.stride(0) == 0 and len(local_embeddings) > 1
         ):  # v, expanded: the same for all as well
             local = local_embeddings.shape[1]
-            of_all = of_all + functional.linear(local_embeddings[0], weight[:, :local])
+            of_all = of_all + functional.linear(local_embeddings[:1], weight[:, :local])[0]
             return linear_over_rows(intrinsic, weight[:, local:], of_all)
         # In the precision of the product that reads them: to join them first would cost a copy of both in full.
         rows = torch.cat([local_embeddings.to(self.precision), intrinsic], dim=1)
