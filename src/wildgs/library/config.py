@@ -11,8 +11,8 @@ from wildgs.model.config import Ablation
 from wildgs.model.registry import DEFAULT_METHOD, METHODS
 from wildgs.presets import PRESET_NAMES, PresetName
 
-ExportFormat = Literal["html", "ply", "compressed.ply", "splat", "spz", "sog"]
-"""The page, and files for other programs."""
+ExportFormat = Literal["html", "glb", "usd", "ply", "compressed.ply", "splat", "spz", "sog"]
+"""Files with several lights (the page, glTF, OpenUSD), and files with one."""
 
 Suite = Literal["phototourism"]
 HALF = "-half-steps"

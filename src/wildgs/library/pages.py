@@ -66,7 +66,7 @@ def write_webpage(
     splats = baked(loaded, looks[0])
     keep = kept_rows(cleanup, splats, scene.points)
     lights = [
-        PageLight(look.name, look.sh.cpu().detach()[keep], _thumbnail(loaded, look, views[number]))
+        PageLight(look.name, look.sh.cpu().detach()[keep], thumbnail(loaded, look, views[number]))
         for look in looks
     ]
     page = Page(
@@ -110,7 +110,7 @@ def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
     return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
 
 
-def _thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
+def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
     """The photo whose light it is; where it is none of the scene's, the first view under that light."""
     view = match_view(loaded.views, look.name)
     pixels = loaded.render(start.camera, look) if view is None else view.read_photo()
