@@ -62,8 +62,8 @@ class TrajectoryOptions:
 
     path: str | None = None
     """orbit, training, spiral, views (through --view), still (at --view), or a camera file (docs/cameras.md)."""
-    seconds: float = 5.0
-    """Length of the video in seconds."""
+    seconds: float | None = None
+    """Length of the video in seconds; by default 5, and 10 for --over day."""
     fps: float | None = None
     """Frames per second; by default 30, or the camera file's own."""
     size: tuple[int, int] | None = None
