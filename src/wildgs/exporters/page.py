@@ -65,6 +65,7 @@ class Page:
         lights: Appearances, from left to right.
         start: Initial view.
         near: Near plane, world units.
+        day: Whether the lights are those of a day in order, which the page can play.
     """
 
     title: str
@@ -73,6 +74,7 @@ class Page:
     lights: Sequence[PageLight]
     start: PageView
     near: float
+    day: bool = False
 
 
 def write_page(
@@ -121,6 +123,7 @@ def _compose(page: Page, scene: PackedScene) -> str:
     header = {
         **scene.header,
         "near": page.near,
+        "day": page.day,
         "start": _start(page.start),
         "lights": [
             {"name": light.name, "thumbnail": thumbnail_url(light.thumbnail)} for light in page.lights

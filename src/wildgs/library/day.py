@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +17,6 @@ from wildgs.exporters.page import choose_start
 from wildgs.files import written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
-from wildgs.library.pages import viewpoints_of
 from wildgs.library.times import read_captures
 from wildgs.light.captures import Capture
 from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
@@ -102,15 +102,34 @@ def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None)
     return found
 
 
-def _read(file: Path, step: int, timed: int) -> Day | None:
-    """What was found before for the same checkpoint and the same number of photos with times."""
+def _read(file: Path, step: int, timed: int | None = None) -> Day | None:
+    """What was found before for the same checkpoint and, unless None, the same number of photos with times."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        if (content.pop("step"), content.pop("timed")) != (step, timed):
+        found_step, found_timed = content.pop("step"), content.pop("timed")
+        if found_step != step or timed not in (None, found_timed):
             return None
         return Day(**{**content, "keys": tuple(content["keys"])})
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
+    """Camera centres, evenly chosen where there are many."""
+    chosen = views[:: max(1, -(-len(views) // 64))]
+    return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
+
+
+def has_day(loaded: LoadedScene) -> bool:
+    """Whether a run's light changes, and it has photos enough for a day."""
+    return len(_usable_views(loaded)) >= LEAST_PHOTOS
+
+
+def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:
+    """Whether these are several photos in the order of the day that was found for the run."""
+    day = _read(loaded.run.folder / DAY_FILE, loaded.run.step)
+    known = [day.phases[name] for name in names if name in day.phases] if day else []
+    return len(known) == len(names) > 1 and known == sorted(known)
 
 
 def start_view(loaded: LoadedScene) -> View:

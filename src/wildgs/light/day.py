@@ -2,8 +2,8 @@
 
 The luminance of every Gaussian relative to the scene's mean does not depend on exposure. How it varies from photo
 to photo is mostly the height of the sun: lit and shaded sides, long shadows, lamps. The axis is learnt for each
-scene, from the hours of photos where they are known, otherwise from rough statistics that hold anywhere (under a low
-sun photos are warm, dark and of high contrast, and lit sides are warmer than shaded ones).
+scene, from the hours of photos where they are known, otherwise from rough statistics that hold anywhere (under a
+low sun photos are warm, dark and of high contrast, and lit sides are warmer than shaded ones).
 """
 
 from __future__ import annotations
