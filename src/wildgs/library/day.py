@@ -125,9 +125,14 @@ def has_day(loaded: LoadedScene) -> bool:
     return len(_usable_views(loaded)) >= LEAST_PHOTOS
 
 
+def known_day(loaded: LoadedScene) -> Day | None:
+    """The day that was found for the run before, if one was."""
+    return _read(loaded.run.folder / DAY_FILE, loaded.run.step)
+
+
 def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:
     """Whether these are several photos in the order of the day that was found for the run."""
-    day = _read(loaded.run.folder / DAY_FILE, loaded.run.step)
+    day = known_day(loaded)
     known = [day.phases[name] for name in names if name in day.phases] if day else []
     return len(known) == len(names) > 1 and known == sorted(known)
 
