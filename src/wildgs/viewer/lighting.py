@@ -71,7 +71,8 @@ class LightDesk:
         """The desk at a share of a day: between two of the photos that show it, at least two, in order."""
         position = min(max(share, 0.0), 1.0) * (len(day) - 1)
         index = min(int(position), len(day) - 2)
-        return cls(*(Light(name, name) for name in day[index : index + 2]), position - index)
+        before, after = (Light(name, name) for name in day[index : index + 2])
+        return cls(before, after, position - index)
 
     def look(self, subject: Subject) -> Look:
         """The mixed light; encodes a photo only when its light is needed.
