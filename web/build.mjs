@@ -7,7 +7,7 @@ import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 
 const here = dirname(fileURLToPath(import.meta.url));
-const target = join(here, "..", "src", "wildgs", "export", "web");
+const target = join(here, "..", "src", "wildgs", "exporters", "web");
 const BUNDLED = ["@sparkjsdev/spark", "three", "fflate"];
 
 async function licenseOf(name) {

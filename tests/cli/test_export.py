@@ -27,12 +27,16 @@ def test_the_page_holds_the_lights_asked_for(wildgs, trained: Path, tmp_path: Pa
     assert str(file) in capsys.readouterr().out
 
 
-def test_without_appearances_the_page_takes_four_photos(wildgs, trained: Path, tmp_path: Path) -> None:
+def test_without_appearances_the_page_takes_the_lights_of_a_day(
+    wildgs, trained: Path, tmp_path: Path
+) -> None:
     assert wildgs("export", trained, "--output", tmp_path) == 0
     header = (
         (tmp_path / "page.html").read_text(encoding="utf-8").split('id="header">')[1].split("</script>")[0]
     )
-    assert len({light["name"] for light in json.loads(header)["lights"]}) == 4
+    found = json.loads(header)
+    assert found["day"]
+    assert 4 <= len({light["name"] for light in found["lights"]}) <= 6
 
 
 def test_a_file_is_baked_for_each_appearance_in_the_inputs_frame(
@@ -74,3 +78,22 @@ def test_mistakes_are_one_line(wildgs, trained: Path, tmp_path: Path, capsys, ar
     assert error.startswith("error: ")
     assert message in error
     assert not (tmp_path / "out").exists()
+
+
+def test_glb_and_usd_hold_all_lights(wildgs, trained: Path, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed")
+    names = _names(trained)[:3]
+    assert (
+        wildgs("export", trained, "--format", "glb", "usd", "--appearance", *names, "--output", tmp_path) == 0
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.glb", "scene.usd"]
+    said = capsys.readouterr().out
+    assert said.count("Gaussians, 3 lights") == 2
+    content = (tmp_path / "scene.glb").read_bytes()
+    described = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    assert [scene["name"] for scene in described["scenes"]] == names
+    back = described["asset"]["extras"]["to_colmap"]
+    low = described["accessors"][0]["min"]
+    assert np.isfinite(low).all()
+    assert np.linalg.det(back["rotation"]) == pytest.approx(1.0)
+    assert back["scale"] == pytest.approx(1.0)

@@ -167,3 +167,61 @@ def test_it_opened_without_network_and_without_complaint(opened: dict[str, Any])
     assert [url for url in opened["asked"] if url.startswith("file:")] == [opened["file"].as_uri()]
     assert opened["said"] == []
     assert opened["tab"].evaluate("document.querySelector('h1').textContent") == "Test & <title>"
+
+
+STATE = """async () => {
+  const page = await wildgs.ready;
+  await page.settle();
+  const { position, target } = page.navigation.place();
+  return { position, target, light: page.lights.value };
+}"""
+
+
+def test_the_link_to_a_view_reopens_it_on_a_phone(opened: dict[str, Any], chromium) -> None:
+    tab = opened["tab"]
+    tab.locator("#reset").click()
+    tab.mouse.move(200, 120)
+    tab.mouse.down()
+    tab.mouse.move(250, 140, steps=4)
+    tab.mouse.up()
+    tab.evaluate(LIGHT, 0.25)
+    tab.locator("#link").click()
+    wanted = tab.evaluate(STATE)
+    assert "#view=" in tab.url
+    phone = chromium.new_page(viewport={"width": 390, "height": 760}, has_touch=True, is_mobile=True)
+    phone.goto(tab.url)
+    phone.wait_for_function("document.documentElement.dataset.state", timeout=PATIENCE)
+    found = phone.evaluate(STATE)
+    assert found["light"] == pytest.approx(0.25)
+    for key in ("position", "target"):
+        np.testing.assert_allclose(found[key], wanted[key], atol=2e-3)
+    box = phone.locator("#lights").bounding_box()
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= 390
+    phone.touchscreen.tap(*(box["x"] + box["width"] / 2, box["y"] + 30))
+    phone.close()
+
+
+def test_a_link_that_makes_no_sense_opens_the_first_view(opened: dict[str, Any]) -> None:
+    tab = opened["tab"]
+    tab.locator("#reset").click()
+    before = tab.evaluate(STATE)
+    tab.evaluate("location.hash = '#view=1,2,nobody&light=bright'")
+    assert tab.evaluate(STATE) == before
+
+
+def test_a_day_passes_while_it_plays(chromium, splats: Splats, tmp_path: Path) -> None:
+    shade = np.full((20, 30, 3), 90, np.uint8)
+    lights = [PageLight(f"{n}.jpg", splats.sh[:, :1] + 0.3 * n, shade) for n in range(3)]
+    few = splats.with_sh(splats.sh[:, :1])
+    page = Page("A day", "", few, lights, PageView(_camera(), 7.0), NEAR, day=True)
+    write_page(page, tmp_path / "day.html")
+    tab = chromium.new_page(viewport={"width": 200, "height": 150})
+    tab.goto((tmp_path / "day.html").as_uri())
+    tab.wait_for_function("document.documentElement.dataset.state", timeout=PATIENCE)
+    assert tab.locator("#play").inner_text() == "Day"
+    tab.locator("#play").click()
+    tab.wait_for_function("Number(document.getElementById('slider').value) > 0.4", timeout=PATIENCE)
+    tab.wait_for_function("Number(document.getElementById('slider').value) > 1.2", timeout=PATIENCE)
+    tab.locator("#play").click()
+    tab.close()

@@ -44,3 +44,13 @@ def test_the_light_moves_without_jumps(looks) -> None:
 def test_nothing_is_no_light() -> None:
     with pytest.raises(UserError, match="at least one"):
         Timeline.of([])
+
+
+def test_a_paced_timeline_spends_its_time_where_much_changes(looks) -> None:
+    timeline = Timeline(tuple(looks)).paced([3.0, 0.0, 0.0, 1.0])
+    assert timeline.at(0.0) is looks[0]
+    assert timeline.at(1.0) is looks[2]
+    quarter = timeline.at(0.75 / 2).embeddings.global_embedding  # half of the first of four parts
+    expected = 0.75 * looks[0].embeddings.global_embedding + 0.25 * looks[1].embeddings.global_embedding
+    torch.testing.assert_close(quarter, expected)
+    assert Timeline(tuple(looks)).paced([0.0, 0.0]).at(0.5) is looks[1]

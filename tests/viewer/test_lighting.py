@@ -40,6 +40,13 @@ def test_a_light_that_is_not_needed_is_not_looked_for(subject: Subject) -> None:
         LightDesk(DARK, missing, 0.5).look(subject)
 
 
+def test_a_day_goes_from_photo_to_photo() -> None:
+    day = ("dawn.jpg", "noon.jpg", "dusk.jpg")
+    desks = {share: LightDesk.at_hour(day, share) for share in (-1.0, 0.0, 0.25, 0.5, 1.0, 7.0)}
+    assert [desks[share].first.spec for share in desks] == ["dawn.jpg"] * 3 + ["noon.jpg"] * 3
+    assert [desks[share].amount for share in desks] == [0.0, 0.0, 0.5, 0.0, 1.0, 1.0]
+
+
 def test_a_chosen_light_is_seen_at_once() -> None:
     desk = LightDesk(DARK, DARK, 0.5)
     assert desk.with_light(BRIGHT, SIDES[0]) == LightDesk(BRIGHT, DARK, 0.0)

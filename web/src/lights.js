@@ -1,11 +1,13 @@
-// The strip of lights: a thumbnail for each, and a slider that runs from the first to the last.
+// The strip of lights: a thumbnail for each, and a slider that runs from the first to the last. Where the lights are
+// those of a day in order, playing passes the day.
 
 const GLIDE = 700; // milliseconds from one light to another
 const STAY = 900; // milliseconds at each while playing
+const DAY = 10_000; // milliseconds of a day
 
 /** Shows which light is on, and changes it. */
 export class Lights {
-  constructor({ strip, slider, play }, lights, blend) {
+  constructor({ strip, slider, play }, lights, day, blend) {
     this.slider = slider;
     this.play = play;
     this.blend = blend;
@@ -15,7 +17,12 @@ export class Lights {
     strip.replaceChildren(...this.buttons);
     slider.max = String(this.count - 1);
     slider.addEventListener("input", () => this.set(Number(slider.value)));
-    play.addEventListener("click", () => (this.playing ? this.stop() : this.tour()));
+    play.addEventListener("click", () => (this.playing ? this.stop() : day ? this.passDay() : this.tour()));
+    if (day) {
+      play.textContent = "Day";
+      play.title = "A day in ten seconds";
+      slider.setAttribute("aria-label", "Time of day");
+    }
     slider.hidden = play.hidden = this.count < 2;
     this.set(0);
   }
@@ -86,6 +93,21 @@ export class Lights {
       this.glide((Math.round(this.value) + 1) % this.count, () => (this.pause = setTimeout(next, STAY)));
     };
     next();
+  }
+
+  /** From the light that is on to the end of the day, then from its beginning, until stopped. */
+  passDay() {
+    this.playing = true;
+    this.play.setAttribute("aria-pressed", "true");
+    const last = this.count - 1;
+    let before = performance.now();
+    const step = (now) => {
+      const next = this.value + (Math.max(0, now - before) / DAY) * last;
+      before = now;
+      this.place(this.value >= last ? 0 : next);
+      this.animation = requestAnimationFrame(step);
+    };
+    this.animation = requestAnimationFrame(step);
   }
 
   stop() {

@@ -23,12 +23,13 @@ class Page {
     this.fixed = null;
     this.navigation = new Navigation(this.stage, this.canvas, header.start, () => this.moved());
     const controls = { strip: element("strip"), slider: element("slider"), play: element("play") };
-    this.lights = new Lights(controls, header.lights, (from, to, amount) => {
+    this.lights = new Lights(controls, header.lights, header.day, (from, to, amount) => {
       this.stage.blend(from, to, amount);
       this.moved();
     });
     this.connect();
     this.resize();
+    this.followLink();
     requestAnimationFrame((now) => this.frame(now, now));
   }
 
@@ -42,6 +43,8 @@ class Page {
     element("full").addEventListener("click", () => this.toggleFullScreen());
     element("full").hidden = !document.documentElement.requestFullscreen;
     element("info").addEventListener("click", () => element("about").showModal());
+    element("link").addEventListener("click", () => this.copyLink());
+    window.addEventListener("hashchange", () => this.followLink());
     window.addEventListener("keydown", (event) => (this.shift = event.shiftKey));
     window.addEventListener("keyup", (event) => (this.shift = event.shiftKey));
     this.canvas.addEventListener("pointerdown", () => this.free());
@@ -123,6 +126,34 @@ class Page {
     view.invert().decompose(camera.position, camera.quaternion, camera.scale);
     camera.updateMatrixWorld(true);
     this.stage.invalidate();
+  }
+
+  /** Camera and light as the address's fragment. */
+  fragment() {
+    const { position, target } = this.navigation.place();
+    const numbers = [...position, ...target].map((value) => value.toFixed(4));
+    return `#view=${numbers.join(",")}&light=${this.lights.value.toFixed(3)}`;
+  }
+
+  /** Puts the link to this view into the address, and into the clipboard where the browser lets it. */
+  async copyLink() {
+    history.replaceState(null, "", this.fragment());
+    await navigator.clipboard?.writeText(location.href).catch(() => {});
+    element("link").textContent = "Copied";
+    setTimeout(() => (element("link").textContent = "Link"), 1500);
+  }
+
+  /** Takes camera and light from the address; what makes no sense there is left out. */
+  followLink() {
+    const wanted = new URLSearchParams(location.hash.slice(1));
+    const numbers = (wanted.get("view") ?? "").split(",").map(Number);
+    if (numbers.length === 6 && numbers.every(Number.isFinite)) {
+      this.free();
+      this.setMode("orbit");
+      this.navigation.goTo(numbers.slice(0, 3), numbers.slice(3));
+    }
+    const light = Number.parseFloat(wanted.get("light") ?? "");
+    if (Number.isFinite(light)) this.lights.set(light);
   }
 
   free() {

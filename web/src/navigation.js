@@ -38,7 +38,18 @@ export class Navigation {
 
   /** Back to where the page opened. */
   reset() {
-    const { position, target } = this.start;
+    this.goTo(this.start.position, this.start.target);
+  }
+
+  /** Where the camera is, and what it looks at. */
+  place() {
+    const distance = this.camera.position.distanceTo(this.orbit.target);
+    const target = this.forward().multiplyScalar(distance).add(this.camera.position);
+    return { position: this.camera.position.toArray(), target: target.toArray() };
+  }
+
+  /** Puts the camera somewhere, and lets it look at a point. */
+  goTo(position, target) {
     this.camera.position.fromArray(position);
     this.orbit.target.fromArray(target);
     this.camera.up.copy(UP);

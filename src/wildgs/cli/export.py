@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -16,10 +16,10 @@ from wildgs.library.config import ExportFormat, MixOptions
 
 @dataclass(frozen=True)
 class Command:
-    """Writes a run as files for other programs, one for each appearance, or as one web page with all of them.
+    """Writes a run as files for other programs.
 
-    The page opens from disk without server or network. Other files hold the scene under one light, in the frame
-    and scale of the photos' reconstruction.
+    html (a page that opens from disk, without server or network), glb (glTF) and usd (OpenUSD) hold all appearances
+    in one file. The others are written once for each appearance, in the frame and scale of the reconstruction.
 
     Example: wildgs export runs/gate --format html --appearance evening.jpg noon.jpg night.jpg
     """
@@ -27,10 +27,10 @@ class Command:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     format: tuple[ExportFormat, ...] = ("html",)
-    """One or several of html, ply, compressed.ply, splat, spz, sog."""
+    """One or several of html, glb, usd, ply, compressed.ply, splat, spz, sog."""
     appearance: tuple[str, ...] = ()
     """Photos of the scene by name, files of new photos or any pictures, saved appearances, or neutral. By default
-    the page takes four photos as different as the scene has them, and other files are neutral."""
+    html, glb and usd take photos as different as the scene has them, and other files are neutral."""
     mix: Mix = field(default_factory=MixOptions)
     output: Path | None = None
     """Folder for the files; by default RUN/export. With one file to write, it may be the file itself."""
@@ -38,6 +38,8 @@ class Command:
     """The page's headline; by default the run folder's name."""
     aligned: bool = False
     """Keep the frame of training (+z up, the photos' median depth is 1) instead of the input's."""
+    spz_version: Literal[3, 4] = 4
+    """Of spz: 4, or 3 for programs that do not know 4 yet."""
     cleanup: Annotated[CleanupConfig, UNNAMED] = field(default_factory=CleanupConfig)
 
 
@@ -54,14 +56,16 @@ def run(command: Command) -> None:
             title=command.title,
             aligned=command.aligned,
             cleanup=command.cleanup,
+            spz_version=command.spz_version,
             mixing=command.mix,
             progress=screen,
         )
     print_notes({look: None for file in written for look in file.looks})
     for file in written:
         size = f"{file.file}: {file.megabytes:.1f} MB, {file.num_gaussians:,} Gaussians"
-        if file.file.suffix == ".html":
+        if file.file.suffix in (".html", ".glb", ".usd"):
             lights = f"{len(file.looks)} lights" if len(file.looks) > 1 else "1 light"
-            console.print(f"{size}, {lights}, harmonics of degree {file.sh_degree}; open it in a browser")
+            hint = "; open it in a browser" if file.file.suffix == ".html" else ""
+            console.print(f"{size}, {lights}, harmonics of degree {file.sh_degree}{hint}")
         else:
             console.print(f"{size} under {file.looks[0].name}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -17,14 +17,17 @@ class CleanupConfig:
             keeps all.
         sh_degree: Spherical harmonics are truncated to this degree, fitted to the viewing directions of the photos;
             None keeps all.
+        own_harmonics: Of files with several lights: share of the Gaussians that keep their own harmonics above
+            degree 0 in each light of a .glb; the others share them between all lights. 1 shares nothing.
     """
 
     min_opacity: float = 0.0
     max_distance: float | None = None
     crop: float | None = None
     sh_degree: int | None = None
+    own_harmonics: float = 0.09
 
     @property
     def active(self) -> bool:
         """Whether anything may be dropped."""
-        return self != CleanupConfig()
+        return replace(self, own_harmonics=CleanupConfig.own_harmonics) != CleanupConfig()

@@ -14,9 +14,13 @@ import torch
 from wildgs.errors import UserError
 from wildgs.exporters.splats import Splats
 from wildgs.files import written_aside
+from wildgs.geometry.spherical_harmonics import MAX_DEGREE, num_sh_bases
 
 SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog"]
 """File extensions: 3DGS, PlayCanvas compressed PLY, antimatter15, Niantic SPZ, and PlayCanvas SOG."""
+
+SpzVersion = Literal[3, 4]
+"""Of .spz: 4 is compressed by Zstandard, 3 by gzip."""
 
 _LEAST_OPACITY = 1e-6
 """Opacities closer to 0 or 1 have no finite logit in single precision."""
@@ -25,32 +29,44 @@ _SPZ_HALF_RANGE = 2**23
 """Coordinates in .spz are signed fixed-point numbers of 24 bits."""
 
 
-def write_splats(file: Path, splats: Splats, kind: SplatFormat) -> None:
+def write_splats(
+    file: Path, splats: Splats, kind: SplatFormat, *, full_sh: bool = True, spz_version: SpzVersion = 4
+) -> None:
     """Writes Gaussians, in the frame of the file, to a file; missing folders are created.
 
     `ply` is lossless. The others quantise, and `splat` keeps harmonics of degree 0 only. The axes of the Gaussians
     are kept; COLMAP and 3DGS programs read them as x right, y down, z forward. Only `spz`, which specifies x right,
     y up, z backward, is rotated by 180 degrees about x.
 
+    Args:
+        file: The file.
+        splats: The Gaussians.
+        kind: Its format.
+        full_sh: Of `ply`: write harmonics of degree 3, with zeros for degrees that the Gaussians do not have, since
+            many programs read no other layout.
+        spz_version: Of `spz`: 4 (Zstandard; what PlayCanvas reads) or 3 (gzip; what older programs read).
+
     Raises:
         UserError: The format needs a package that is not installed, or the package fails.
     """
     if kind in ("compressed.ply", "spz"):
-        content = _by_gsply(splats, kind)
+        content = _by_gsply(splats, kind, spz_version)
     else:
-        content = ply_bytes(splats) if kind == "ply" else _by_gaussforge(splats, kind)
+        content = ply_bytes(splats, full_sh=full_sh) if kind == "ply" else _by_gaussforge(splats, kind)
     with written_aside(file) as aside:
         aside.write_bytes(content)
 
 
-def ply_bytes(splats: Splats) -> bytes:
+def ply_bytes(splats: Splats, *, full_sh: bool = False) -> bytes:
     """Content of a .ply file in the layout of the original 3DGS, which all 3DGS programs read.
 
     Per Gaussian, as 32-bit floats: x y z, an unused normal, f_dc (degree 0, r g b), f_rest (higher degrees: all of
-    red, then green, then blue), opacity (logit), scale (logarithm), rot (unit quaternion w x y z).
+    red, then green, then blue), opacity (logit), scale (logarithm), rot (unit quaternion w x y z). `full_sh` writes
+    all 45 f_rest.
     """
     count = len(splats)
-    rest = splats.sh[:, 1:].transpose(1, 2).reshape(count, -1)
+    missing = num_sh_bases(MAX_DEGREE) - splats.sh.shape[1] if full_sh else 0
+    rest = torch.nn.functional.pad(splats.sh[:, 1:], (0, 0, 0, missing)).transpose(1, 2).reshape(count, -1)
     columns = {
         "xyz": splats.means,
         "normals": torch.zeros(count, 3),
@@ -83,13 +99,17 @@ def _by_gaussforge(splats: Splats, kind: SplatFormat) -> bytes:
     return result["data"]
 
 
-def _by_gsply(splats: Splats, kind: SplatFormat) -> bytes:
+def _by_gsply(splats: Splats, kind: SplatFormat, spz_version: SpzVersion) -> bytes:
     """Converts through files, since gsply has no other interface for both formats."""
     gsply = _package("gsply", kind)
     spz = kind == "spz"
     placed = splats.rotated(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats
     write: Callable[..., Any] = gsply.write_spz if spz else gsply.plywrite
-    options: dict[str, Any] = {"fractional_bits": _spz_bits(placed)} if spz else {"compressed": True}
+    options: dict[str, Any] = {"compressed": True}
+    if spz:
+        options = {"fractional_bits": _spz_bits(placed), "version": spz_version}
+        if spz_version == 4:
+            _package("zstandard", kind)
     with TemporaryDirectory() as folder:
         plain, target = Path(folder, "plain.ply"), Path(folder, f"target.{kind}")
         plain.write_bytes(ply_bytes(placed))

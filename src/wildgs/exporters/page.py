@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from wildgs.exporters.page_scene import PackedScene, pack_scene
 from wildgs.exporters.splats import Splats
+from wildgs.exporters.thumbnail import thumbnail_url
 from wildgs.files import printable, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
@@ -30,9 +29,6 @@ BUDGET_BYTES = 25_000_000
 
 _MIDDLE = 0.3
 """Half size of the central part of a picture whose points give the distance of the landmark."""
-
-THUMBNAIL = (288, 192)
-_QUALITY = 82
 
 
 @dataclass(frozen=True)
@@ -69,6 +65,7 @@ class Page:
         lights: Appearances, from left to right.
         start: Initial view.
         near: Near plane, world units.
+        day: Whether the lights are those of a day in order, which the page can play.
     """
 
     title: str
@@ -77,6 +74,7 @@ class Page:
     lights: Sequence[PageLight]
     start: PageView
     near: float
+    day: bool = False
 
 
 def write_page(
@@ -125,8 +123,11 @@ def _compose(page: Page, scene: PackedScene) -> str:
     header = {
         **scene.header,
         "near": page.near,
+        "day": page.day,
         "start": _start(page.start),
-        "lights": [{"name": light.name, "thumbnail": _thumbnail(light.thumbnail)} for light in page.lights],
+        "lights": [
+            {"name": light.name, "thumbnail": thumbnail_url(light.thumbnail)} for light in page.lights
+        ],
     }
     return Template(web.joinpath("page.html").read_text(encoding="utf-8")).substitute(
         title=escape(printable(page.title)),
@@ -153,19 +154,6 @@ def _start(view: PageView) -> dict[str, Any]:
         "fov_y": float(2 * torch.atan(0.5 * camera.height / camera.K[1, 1])),
         "aspect": float(camera.width / camera.height * camera.K[1, 1] / camera.K[0, 0]),
     }
-
-
-def _thumbnail(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
-    """Centre crop of a picture as a data URL."""
-    image = Image.fromarray(np.ascontiguousarray(pixels))
-    wide, tall = THUMBNAIL
-    scale = max(wide / image.width, tall / image.height)
-    size = (max(wide, round(image.width * scale)), max(tall, round(image.height * scale)))
-    image = image.resize(size, Image.Resampling.LANCZOS)
-    left, top = (image.width - wide) // 2, (image.height - tall) // 2
-    buffer = io.BytesIO()
-    image.crop((left, top, left + wide, top + tall)).save(buffer, "JPEG", quality=_QUALITY)
-    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tuple[int, float]:

@@ -63,9 +63,12 @@ class Splats:
 
     def to_input_frame(self, alignment: Alignment) -> Splats:
         """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale."""
-        back = alignment.inverse()
-        rotated = self.rotated(back.rotation)
-        return replace(rotated, means=back.apply_points(self.means), scales=self.scales * back.scale)
+        return self.moved(alignment.inverse())
+
+    def moved(self, motion: Alignment) -> Splats:
+        """The Gaussians after a rotation, a change of scale and a translation of the world."""
+        rotated = self.rotated(motion.rotation)
+        return replace(rotated, means=motion.apply_points(self.means), scales=self.scales * motion.scale)
 
     def rotated(self, rotation: Float[Tensor, "3 3"]) -> Splats:
         """The Gaussians after a rotation of the world about its origin, including their harmonics."""

@@ -11,8 +11,8 @@ from wildgs.model.config import Ablation
 from wildgs.model.registry import DEFAULT_METHOD, METHODS
 from wildgs.presets import PRESET_NAMES, PresetName
 
-ExportFormat = Literal["html", "ply", "compressed.ply", "splat", "spz", "sog"]
-"""The page, and files for other programs."""
+ExportFormat = Literal["html", "glb", "usd", "ply", "compressed.ply", "splat", "spz", "sog"]
+"""Files with several lights (the page, glTF, OpenUSD), and files with one."""
 
 Suite = Literal["phototourism"]
 HALF = "-half-steps"
@@ -62,8 +62,8 @@ class TrajectoryOptions:
 
     path: str | None = None
     """orbit, training, spiral, views (through --view), still (at --view), or a camera file (docs/cameras.md)."""
-    seconds: float = 5.0
-    """Length of the video in seconds."""
+    seconds: float | None = None
+    """Length of the video in seconds; by default 5, and 10 for --over day."""
     fps: float | None = None
     """Frames per second; by default 30, or the camera file's own."""
     size: tuple[int, int] | None = None

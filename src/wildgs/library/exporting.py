@@ -5,21 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
+
+import torch
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
 from wildgs.exporters.config import CleanupConfig
-from wildgs.exporters.formats import SplatFormat, write_splats
+from wildgs.exporters.formats import SplatFormat, SpzVersion, write_splats
+from wildgs.exporters.glb import glb_bytes
+from wildgs.exporters.lights import ExportLight, RelightableScene, SharedHarmonics, share_harmonics, upright
+from wildgs.exporters.page import choose_start
 from wildgs.exporters.splats import Splats, agreement, clean
+from wildgs.exporters.usd import write_usd
+from wildgs.files import written_aside
 from wildgs.library.config import ExportFormat, MixOptions
+from wildgs.library.day import viewpoints_of
 from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.library.logs import logger
-from wildgs.library.pages import ExportedFile, baked, page_looks, viewpoints_of, write_webpage
+from wildgs.library.pages import ExportedFile, baked, page_looks, thumbnail, write_webpage
+from wildgs.library.times import read_times
 from wildgs.light.look import NEUTRAL, Look
+from wildgs.model.gaussians import NEAR
 from wildgs.progress import Progress
+from wildgs.scene import Alignment
 
 COMPARED_VIEWS = 4
-PAGE_FILE = "page.html"
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,7 @@ class _Request:
     title: str
     aligned: bool
     cleanup: CleanupConfig
+    spz_version: SpzVersion
 
 
 def export(
@@ -42,20 +54,23 @@ def export(
     title: str | None = None,
     aligned: bool = False,
     cleanup: CleanupConfig | None = None,
+    spz_version: SpzVersion = 4,
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> list[ExportedFile]:
-    """Writes a run as files for other programs, one for each appearance, or as one web page with all of them.
+    """Writes a run as files for other programs: html, glb and usd hold all appearances, the others one each.
 
     Args:
         run: A run folder, or a loaded scene.
         formats: One or several of `ExportFormat`.
-        appearance: What `LoadedScene.appearance` takes. By default the page takes four photos as different as the
-            scene has them, and other files are neutral.
+        appearance: What `LoadedScene.appearance` takes. By default html, glb and usd take photos as
+            different as the scene has them, and other files are neutral.
         output: Folder for the files, by default RUN/export; with one file to write, it may be the file itself.
         title: The page's headline; by default the run folder's name.
         aligned: Keep the frame of training (+z up, the photos' median depth is 1) instead of the input's.
-        cleanup: What to leave out.
+        cleanup: What to leave out. Unless it sets a degree, .ply files have all 45 coefficients above degree 0,
+            zeros where the run has none.
+        spz_version: 4, or 3 for programs that do not know 4 yet.
         mixing: How appearances are found and mixed.
         progress: Called during long work.
 
@@ -63,9 +78,9 @@ def export(
         UserError: An appearance cannot be had, nothing is left to write, or a file cannot be written.
     """
     formats = [formats] if isinstance(formats, str) else list(formats)
-    kinds: list[SplatFormat] = [kind for kind in formats if kind != "html"]
+    kinds: list[SplatFormat] = [kind for kind in formats if kind not in ("html", "glb", "usd")]
     if not formats:
-        raise UserError("--format needs at least one of html, ply, compressed.ply, splat, spz, sog")
+        raise UserError(f"--format needs at least one of {', '.join(get_args(ExportFormat))}")
     scene = loaded(run)
     folder = scene.run.folder
     request = _Request(
@@ -74,15 +89,18 @@ def export(
         title or folder.resolve().name,
         aligned,
         cleanup or CleanupConfig(),
+        spz_version,
     )
     chosen = bool(appearance) or (mixing or MixOptions()) != MixOptions()
     looks = find_looks(scene, appearance or (NEUTRAL,), mixing, progress=progress) if kinds or chosen else []
-    files = _files(request, looks, kinds, alone="html" not in formats)
+    files = _files(request, looks, kinds, alone=len(kinds) == len(formats))
+    several = [kind for kind in formats if kind in ("html", "glb", "usd")]
+    shown = looks if chosen or not several else page_looks(scene, progress)
     written = []
-    if "html" in formats:
-        written.append(
-            _write_page(request, looks if chosen else page_looks(scene, progress), alone=not files)
-        )
+    for kind in several:
+        file = _file_of_all(request, f"page.{kind}" if kind == "html" else f"scene.{kind}", len(formats) == 1)
+        write = _write_page if kind == "html" else _write_relightable
+        written.append(write(request, shown, file))
     for look in looks if kinds else ():
         written += _write_look(request, look, {kind: files[look, kind] for kind in kinds})
     return written
@@ -105,13 +123,82 @@ def _files(
     }
 
 
-def _write_page(request: _Request, looks: Sequence[Look], *, alone: bool) -> ExportedFile:
-    file = request.output
-    if not (alone and file.suffix == ".html"):
-        file = file / PAGE_FILE
+def _file_of_all(request: _Request, name: str, alone: bool) -> Path:
+    """Where a file with all lights goes."""
+    output = request.output
+    return output if alone and output.suffix == Path(name).suffix else output / name
+
+
+def _write_page(request: _Request, looks: Sequence[Look], file: Path) -> ExportedFile:
     if request.cleanup.active:
         _cleaned(request, looks[0])
     return write_webpage(request.scene, looks, file, title=request.title, cleanup=request.cleanup)
+
+
+@torch.no_grad()
+def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> ExportedFile:
+    """All lights in one .glb or .usd file."""
+    loaded, collection = request.scene, request.scene.scene
+    viewpoints = viewpoints_of(collection.views)
+    motion = upright(loaded.run.alignment, aligned=request.aligned)
+    splats = [_cleaned(request, look).moved(motion) for look in looks]
+    views = collection.train_views or collection.views
+    start = choose_start([view.camera for view in views], collection.points)[0]
+    times = read_times(loaded)
+    harmonics = share_harmonics(
+        splats[0],
+        [each.sh for each in splats],
+        motion.apply_points(viewpoints),
+        request.cleanup.own_harmonics if file.suffix == ".glb" else 1.0,
+    )
+    content = RelightableScene(
+        title=request.title,
+        splats=splats[0],
+        lights=[
+            ExportLight(look.name, each.sh, thumbnail(loaded, look, views[start]), times.get(look.name))
+            for look, each in zip(looks, splats, strict=True)
+        ],
+        start=motion.apply_camera(views[start].camera),
+        near=NEAR * motion.scale,
+        placement=_to_colmap(motion, loaded.run.alignment),
+    )
+    if file.suffix == ".usd":
+        write_usd(file, content)
+    else:
+        with written_aside(file) as aside:
+            aside.write_bytes(glb_bytes(content, harmonics))
+        _report_shared(request, splats, harmonics, motion)
+    size = file.stat().st_size / 1e6
+    return ExportedFile(file, size, len(splats[0]), splats[0].sh_degree, tuple(looks))
+
+
+def _to_colmap(motion: Alignment, alignment: Alignment) -> Alignment:
+    """From a file's frame to the input's, by way of the aligned frame."""
+    into, back = motion.inverse(), alignment.inverse()
+    return Alignment(
+        back.rotation @ into.rotation, back.apply_points(into.translation), back.scale * into.scale
+    )
+
+
+def _report_shared(
+    request: _Request, splats: Sequence[Splats], harmonics: SharedHarmonics, motion: Alignment
+) -> None:
+    """Logs what sharing harmonics between the lights costs."""
+    if harmonics.all_own:
+        return
+    collection = request.scene.scene
+    cameras = [
+        motion.apply_camera(view.camera)
+        for view in (collection.test_views or collection.views)[:COMPARED_VIEWS]
+    ]
+    same = [
+        agreement(each, each.with_sh(harmonics.whole(number)), cameras) for number, each in enumerate(splats)
+    ]
+    logger.info(
+        f"{len(splats)} lights share harmonics above degree 0, but for {request.cleanup.own_harmonics:.0%} of the "
+        f"Gaussians: {min(same):.1f} to {max(same):.1f} dB PSNR against all of them, over {len(cameras)} views "
+        "(--own-harmonics 1 shares nothing)"
+    )
 
 
 def _write_look(request: _Request, look: Look, files: dict[SplatFormat, Path]) -> list[ExportedFile]:
@@ -120,7 +207,9 @@ def _write_look(request: _Request, look: Look, files: dict[SplatFormat, Path]) -
     placed = splats if request.aligned else splats.to_input_frame(request.scene.run.alignment)
     written = []
     for kind, file in files.items():
-        write_splats(file, placed, kind)
+        write_splats(
+            file, placed, kind, full_sh=request.cleanup.sh_degree is None, spz_version=request.spz_version
+        )
         size = file.stat().st_size / 1e6
         written.append(ExportedFile(file, size, len(placed), placed.sh_degree, (look,)))
     return written

@@ -102,13 +102,14 @@ class LoadedScene:
         return to_8bit(method.render(camera, look.sh, depth=False).colors).cpu()
 
     def frames(
-        self, cameras: Sequence[Camera], looks: Look | Sequence[Look]
+        self, cameras: Sequence[Camera], looks: Look | Sequence[Look] | Timeline
     ) -> Iterator[UInt8[Tensor, "H W 3"]]:
         """Pictures along a trajectory, rendered as they are asked for.
 
         Args:
             cameras: From `path`, or any others in the scene's aligned frame.
-            looks: One, or several between which the light changes evenly from the first frame to the last.
+            looks: One, or several between which the light changes evenly from the first frame to the last, or a
+                timeline.
         """
         timeline = Timeline.of(looks)
         last = max(len(cameras) - 1, 1)

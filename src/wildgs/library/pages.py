@@ -17,6 +17,7 @@ from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write
 from wildgs.exporters.report import MethodScores, Report, ReportExample, ReportMask, write_report
 from wildgs.exporters.splats import CleanupConfig, Splats, kept_rows
 from wildgs.geometry.trajectory import spread_out
+from wildgs.library.day import find_day, has_day, in_order_of_day, viewpoints_of
 from wildgs.library.evaluation import Scores
 from wildgs.library.loaded import LoadedScene, find_looks
 from wildgs.light.look import NEUTRAL, Look
@@ -27,7 +28,7 @@ from wildgs.progress import Progress
 from wildgs.runs import Run
 from wildgs.scene import Scene, View, match_view
 
-PAGE_LIGHTS = 4
+PAGE_LIGHTS = 6
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,10 @@ def write_webpage(
     title: str,
     cleanup: CleanupConfig | None = None,
 ) -> ExportedFile:
-    """Writes the page of a run under some looks, the first of which it opens with; `cleanup` drops Gaussians."""
+    """Writes the page of a run under some looks, the first of which it opens with; `cleanup` drops Gaussians.
+
+    Where the looks are those of photos in the order of the run's day, the page can play the day.
+    """
     cleanup = cleanup or CleanupConfig()
     scene = loaded.scene
     views = scene.train_views or scene.views
@@ -66,7 +70,7 @@ def write_webpage(
     splats = baked(loaded, looks[0])
     keep = kept_rows(cleanup, splats, scene.points)
     lights = [
-        PageLight(look.name, look.sh.cpu().detach()[keep], _thumbnail(loaded, look, views[number]))
+        PageLight(look.name, look.sh.cpu().detach()[keep], thumbnail(loaded, look, views[number]))
         for look in looks
     ]
     page = Page(
@@ -76,6 +80,7 @@ def write_webpage(
         lights=lights,
         start=PageView(views[number].camera, depth),
         near=NEAR,
+        day=in_order_of_day(loaded, [look.name for look in looks]),
     )
     degree = write_page(page, file, viewpoints=viewpoints_of(scene.views), sh_degree=cleanup.sh_degree)
     return ExportedFile(file, file.stat().st_size / 1e6, len(page.splats), degree, tuple(looks))
@@ -88,9 +93,14 @@ def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None
 
 
 def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Look]:
-    """The light of a few photos as unlike each other as the scene has them; the one look of plain 3DGS."""
+    """The lights of a day; of a run with few photos, those most unlike each other; the one look of plain 3DGS."""
     if not loaded.relightable:
         return [loaded.appearance(NEUTRAL)]
+    day = find_day(loaded, progress=progress) if has_day(loaded) else None
+    if day is not None and len(day.keys) > PAGE_LIGHTS // 2:
+        shown = min(PAGE_LIGHTS, len(day.keys))
+        chosen = [day.keys[round(index * (len(day.keys) - 1) / (shown - 1))] for index in range(shown)]
+        return find_looks(loaded, chosen, progress=progress)
     views = loaded.scene.train_views or loaded.views
     misfits = find_misfits(read_photos(loaded.run.folder, loaded.run.step) or [])
     chosen = different_lights(_without(views, misfits), PAGE_LIGHTS)
@@ -104,13 +114,7 @@ def baked(loaded: LoadedScene, look: Look) -> Splats:
     return Splats(*(value.detach().cpu().float() for value in values))
 
 
-def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
-    """Camera centres, evenly chosen where there are many."""
-    chosen = views[:: max(1, -(-len(views) // 64))]
-    return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
-
-
-def _thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
+def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
     """The photo whose light it is; where it is none of the scene's, the first view under that light."""
     view = match_view(loaded.views, look.name)
     pixels = loaded.render(start.camera, look) if view is None else view.read_photo()

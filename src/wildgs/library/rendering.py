@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -17,14 +18,17 @@ from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.trajectory import still
 from wildgs.library.config import MixOptions, TrajectoryOptions
+from wildgs.library.day import day_timeline, find_day, start_view
 from wildgs.library.loaded import LoadedScene, find_looks, loaded
-from wildgs.light.look import NEUTRAL, Look
+from wildgs.light.day import Day
+from wildgs.light.look import NEUTRAL, Look, Timeline
 from wildgs.progress import Progress, counter
 from wildgs.scene import View, find_view
 from wildgs.scene.trajectories import AROUND, THROUGH, read_path
 
 DEFAULT_PATH = "orbit"
 DEFAULT_FPS = 30.0
+DEFAULT_SECONDS, DAY_SECONDS = 5.0, 10.0
 MAX_FRAMES = 100_000
 MAX_SIDE, MAX_PIXELS = 16_384, 2**27
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -42,6 +46,7 @@ class Rendered:
         size: Width and height of the last one.
         fps: Frames per second of a video; None for stills.
         looks: The appearances.
+        day: The day over which the light changes, if it does.
     """
 
     output: Path
@@ -49,6 +54,7 @@ class Rendered:
     size: tuple[int, int]
     fps: float | None
     looks: tuple[Look, ...]
+    day: Day | None = None
 
 
 def render(
@@ -57,6 +63,8 @@ def render(
     *,
     appearance: Sequence[Spec] = (NEUTRAL,),
     to: Sequence[Spec] = (),
+    over: Literal["day"] | None = None,
+    photos: str | Path | None = None,
     views: Sequence[str] = (),
     trajectory: TrajectoryOptions | None = None,
     mixing: MixOptions | None = None,
@@ -70,6 +78,9 @@ def render(
             where there is a path, else of OUTPUT/<appearance>/<view>.png.
         appearance: What `LoadedScene.appearance` takes.
         to: Appearances to which the light changes during a video, one after the other.
+        over: `"day"` shows the lights of the photos in the order of a day (`wildgs.library.day.find_day`),
+            instead of `appearance` and `to`.
+        photos: Folder of the original photos, whose EXIF blocks tell the hour; None takes the scene folder.
         views: Photos whose viewpoint is rendered, by name; by default the held-out photos, or all where none is.
         trajectory: Path, length and size.
         mixing: How appearances are found and mixed.
@@ -81,6 +92,8 @@ def render(
     output, trajectory = Path(output), trajectory or TrajectoryOptions()
     if trajectory.size is not None:
         check_size(*trajectory.size)
+    if over is not None:
+        return _render_day(loaded(run), output, photos, views, trajectory, progress)
     if trajectory.path is None and not is_video(output):
         if to:
             raise UserError("--to changes light over time: add --path, or name a video as --output")
@@ -96,6 +109,30 @@ def render(
     size = (cameras[0].width, cameras[0].height)
     write_frames(output, _frames(scene, cameras, looks, progress), size, fps)
     return Rendered(output, len(cameras), size, fps, tuple(looks))
+
+
+def _render_day(
+    scene: LoadedScene,
+    output: Path,
+    photos: str | Path | None,
+    views: Sequence[str],
+    trajectory: TrajectoryOptions,
+    progress: Progress | None,
+) -> Rendered:
+    """A video over the light of a day."""
+    check_output(output)
+    if trajectory.path == "still" and not views:
+        views = [start_view(scene).name]
+    seconds = DAY_SECONDS if trajectory.seconds is None else trajectory.seconds
+    cameras, fps = _find_cameras(scene, replace(trajectory, seconds=seconds), views)
+    day = find_day(scene, None if photos is None else Path(photos), progress=progress)
+    still_camera = cameras[0] if trajectory.path == "still" else None
+    timeline = day_timeline(scene, day, still_camera, progress=progress)
+    if is_video(output):
+        cameras = [_even(camera) for camera in cameras]
+    size = (cameras[0].width, cameras[0].height)
+    write_frames(output, _frames(scene, cameras, timeline, progress), size, fps)
+    return Rendered(output, len(cameras), size, fps, timeline.looks, day)
 
 
 def check_size(width: int, height: int) -> None:
@@ -180,7 +217,7 @@ def _find_cameras(
         if len(sizes) > 1:
             raise UserError(f"{kind}: the pictures of a video must be of one size")
         return cameras, trajectory.fps or file_fps
-    seconds = trajectory.seconds
+    seconds = DEFAULT_SECONDS if trajectory.seconds is None else trajectory.seconds
     if not (fps > 0 and seconds > 0 and seconds * fps <= MAX_FRAMES):
         raise UserError(
             f"{seconds:g} seconds at {fps:g} frames per second: both must be above 0, and the video at most "
@@ -196,7 +233,7 @@ def _even(camera: Camera) -> Camera:
 
 
 def _frames(
-    scene: LoadedScene, cameras: Sequence[Camera], looks: Sequence[Look], progress: Progress | None
+    scene: LoadedScene, cameras: Sequence[Camera], looks: Sequence[Look] | Timeline, progress: Progress | None
 ) -> Iterator[np.ndarray]:
     show = counter(progress, "rendering")
     for number, picture in enumerate(scene.frames(cameras, looks), start=1):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -137,13 +138,16 @@ def _describe(looks: Sequence[Look], weights: Sequence[float | int], local: Sequ
 
 @dataclass(frozen=True)
 class Timeline:
-    """Looks at even distances over time; between two of them their mix.
+    """Looks one after the other over time; between two of them their mix.
 
     Attributes:
         looks: At least one; a single one does not change.
+        pace: Shares of the time, ascending from 0 to 1, at which even parts of the way are done; empty for an even
+            pace.
     """
 
     looks: tuple[Look, ...]
+    pace: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what shows nothing."""
@@ -151,8 +155,10 @@ class Timeline:
             raise UserError("a video needs at least one appearance")
 
     @classmethod
-    def of(cls, looks: Look | Sequence[Look]) -> Timeline:
+    def of(cls, looks: Look | Sequence[Look] | Timeline) -> Timeline:
         """One look, or several over time."""
+        if isinstance(looks, Timeline):
+            return looks
         return cls((looks,) if isinstance(looks, Look) else tuple(looks))
 
     def at(self, share: float) -> Look:
@@ -160,7 +166,10 @@ class Timeline:
 
         At the looks themselves no mixing and no new shading takes place.
         """
-        position = min(max(share, 0.0), 1.0) * (len(self.looks) - 1)
+        share = min(max(share, 0.0), 1.0)
+        if self.pace:
+            share = float(np.interp(share, self.pace, np.linspace(0, 1, len(self.pace))))
+        position = share * (len(self.looks) - 1)
         index = min(int(position), max(len(self.looks) - 2, 0))
         amount = position - index
         if amount < 1e-9:
@@ -168,3 +177,12 @@ class Timeline:
         if amount > 1 - 1e-9:
             return self.looks[index + 1]
         return mix([self.looks[index], self.looks[index + 1]], [1 - amount, amount])
+
+    def paced(self, changes: Sequence[float]) -> Timeline:
+        """The same looks, at a pace at which a change is spread evenly over time.
+
+        Args:
+            changes: How much changes in each of some even parts of this timeline, not negative.
+        """
+        done = np.concatenate([[0.0], np.cumsum(changes)])
+        return replace(self, pace=tuple((done / done[-1]).tolist()) if done[-1] > 0 else ())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,6 +66,14 @@ class LightDesk:
             return replace(self, first=light, amount=0.0)
         return replace(self, second=light, amount=1.0)
 
+    @classmethod
+    def at_hour(cls, day: Sequence[str], share: float) -> LightDesk:
+        """The desk at a share of a day: between two of the photos that show it, at least two, in order."""
+        position = min(max(share, 0.0), 1.0) * (len(day) - 1)
+        index = min(int(position), len(day) - 2)
+        before, after = (Light(name, name) for name in day[index : index + 2])
+        return cls(before, after, position - index)
+
     def look(self, subject: Subject) -> Look:
         """The mixed light; encodes a photo only when its light is needed.
 
@@ -91,6 +99,7 @@ class LightPanel:
         changed: Callable[[], None],
         lender: Callable[[], str],
         masks_asked: Callable[[bool], None],
+        day: Sequence[str] = (),
     ) -> None:
         """Adds the controls to the open container.
 
@@ -101,6 +110,7 @@ class LightPanel:
             changed: Called on a thread of viser after the desk changed.
             lender: Names the photo whose camera a picture borrows.
             masks_asked: Called, likewise, when masks over the photos are switched on or off.
+            day: Names of the photos that show a day, in order; empty where no day is known.
         """
         self.desk = desk
         self._server, self._gallery = server, gallery
@@ -119,6 +129,11 @@ class LightPanel:
         )
         self.masks.on_update(lambda _: masks_asked(self.masks.value))
         self._slider = gui.add_slider("Mix", 0.0, 1.0, 0.01, desk.amount)
+        if len(day) > 1:
+            self._hour = gui.add_slider(
+                "Day", 0.0, 1.0, 0.002, 0.0, hint="From the first light of a day to the last"
+            )
+            self._hour.on_update(lambda _: self.set_hour(day, self._hour.value))
         self._frames = gui.add_html("")
         self._pair = gui.add_html("")
         self._upload = gui.add_upload_button("A picture of your own", mime_type="image/*")
@@ -149,6 +164,12 @@ class LightPanel:
         if math.isfinite(amount) and amount != self.desk.amount:
             self.touched = True
             self._set(replace(self.desk, amount=min(max(float(amount), 0.0), 1.0)))
+
+    def set_hour(self, day: Sequence[str], share: float) -> None:
+        """Moves along the day."""
+        if math.isfinite(share):
+            self.touched = True
+            self._set(LightDesk.at_hour(day, share))
 
     def take_picture(self, name: str, content: bytes) -> None:
         """Gives the light of a picture that a browser sent to the chosen side; `UserError` if it cannot be used."""

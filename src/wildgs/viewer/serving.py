@@ -19,6 +19,7 @@ import numpy as np
 from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError
 from wildgs.files import printable
+from wildgs.library.day import known_day
 from wildgs.library.loaded import LoadedScene, load
 from wildgs.processes import TerminatedError, signals_as_interrupts
 from wildgs.scene import Scene
@@ -173,7 +174,9 @@ def view(
         scene = run if isinstance(run, LoadedScene) else load(run)
         subject = Subject(scene.run.method, scene.scene, scene.appearance)
         status = f"step {scene.run.step:,}, {len(scene.gaussians):,} Gaussians"
-        page = Viewer(opened, subject, viewer or ViewerConfig(), appearance, status, folder / VIDEO_FOLDER)
+        day, videos = known_day(scene), folder / VIDEO_FOLDER
+        keys = day.keys if day else ()
+        page = Viewer(opened, subject, viewer or ViewerConfig(), appearance, status, videos, keys)
     except BaseException:
         opened.stop()
         raise

@@ -55,6 +55,7 @@ class Viewer:
         lights: Sequence[str] = (),
         status: str = "",
         videos: Path | None = None,
+        day: Sequence[str] = (),
     ) -> None:
         """Builds the page.
 
@@ -65,6 +66,7 @@ class Viewer:
             lights: Up to two appearances to begin with; others are chosen from the photos.
             status: A line about the subject.
             videos: Folder for videos; None if none can be made (training).
+            day: Names of the photos that show a day, in order; empty where no day is known.
         """
         self.server, self.subject = server, subject
         self.jobs = Jobs()
@@ -77,12 +79,12 @@ class Viewer:
         start = subject.views[number]
         self._set_start(start, max(depth, 10 * NEAR))
         self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
-        self._build(lights, status, videos)
+        self._build(lights, status, videos, day)
         server.on_client_connect(self._greet)
         self._ask("light", self._relight)
         self._ask("gallery", self._load_thumbnails)
 
-    def _build(self, lights: Sequence[str], status: str, videos: Path | None) -> None:
+    def _build(self, lights: Sequence[str], status: str, videos: Path | None, day: Sequence[str]) -> None:
         gui = self.server.gui
         self._status = gui.add_html("")
         self.set_status(status)
@@ -97,6 +99,7 @@ class Viewer:
                 self._light_changed,
                 self._nearest_photo,
                 self._masks_asked,
+                day,
             )
             self.lighting.touched = bool(lights)
         with tabs.add_tab("Photos"):

@@ -1,0 +1,26 @@
+"""Small pictures of photos, as text that fits into pages and JSON."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+THUMBNAIL = (288, 192)
+_QUALITY = 82
+
+
+def thumbnail_url(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
+    """Centre crop of a picture as a data URL."""
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    wide, tall = THUMBNAIL
+    scale = max(wide / image.width, tall / image.height)
+    size = (max(wide, round(image.width * scale)), max(tall, round(image.height * scale)))
+    image = image.resize(size, Image.Resampling.LANCZOS)
+    left, top = (image.width - wide) // 2, (image.height - tall) // 2
+    buffer = io.BytesIO()
+    image.crop((left, top, left + wide, top + tall)).save(buffer, "JPEG", quality=_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -1,0 +1,168 @@
+"""The day of a run: which photos show it, and a timeline of their lights that changes at an even pace."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from wildgs.errors import UserError
+from wildgs.evaluation.photos import find_misfits, read_photos
+from wildgs.exporters.page import choose_start
+from wildgs.files import written_aside
+from wildgs.geometry.camera import Camera
+from wildgs.library.loaded import LoadedScene
+from wildgs.library.times import read_captures
+from wildgs.light.captures import Capture
+from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
+from wildgs.light.look import Timeline
+from wildgs.light.photos import MAX_PHOTOS, encode_view
+from wildgs.light.sun import phase_of
+from wildgs.progress import Progress, counter
+from wildgs.scene import View
+
+DAY_FILE = "day.json"
+"""In the run folder: the day that was found, for the checkpoint of which it was found."""
+
+_SAMPLES = 4
+"""Pictures between two keys by which the pace is measured."""
+
+_SIDE = 160
+
+
+@torch.no_grad()
+def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progress | None = None) -> Day:
+    """The photos of a run in the order of a day; kept in the run folder.
+
+    Photos that fit no light (`LoadedScene.misfits`) are not part of it.
+
+    Args:
+        loaded: The run.
+        photos: Folder of the original photos, whose EXIF blocks have times; None takes the scene folder of the run.
+        progress: Called for every photo.
+
+    Raises:
+        UserError: The run has one light only, or too few photos.
+    """
+    captures = read_captures(loaded, photos)
+    kept = loaded.run.folder / DAY_FILE
+    found = None if photos is not None else _read(kept, loaded.run.step, len(captures))
+    if found is not None:
+        return found
+    views = _usable_views(loaded)
+    if len(views) < LEAST_PHOTOS:
+        raise UserError(
+            f"{loaded.run.folder}: a day needs a run whose light changes, with at least {LEAST_PHOTOS} photos"
+        )
+    places = [capture.place for capture in captures.values() if capture.place is not None]
+    place = tuple(np.median(places, axis=0).tolist()) if places else None
+    times = {name: phase_of(capture, place) for name, capture in _comparable(captures, place).items()}
+    day = plan_day(_patterns(loaded, views, progress), times)
+    assert day is not None  # there are enough photos
+    try:
+        with written_aside(kept) as aside:
+            content = {"step": loaded.run.step, "timed": len(captures), **asdict(day)}
+            aside.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    except UserError:  # a run on a read-only disk can still be shown
+        pass
+    return day
+
+
+def _comparable(captures: dict[str, Capture], place: tuple | None) -> dict[str, Capture]:
+    """Captures whose phases follow the same clock: the sun's for all that allow it, if those are most."""
+    solar = {name: each for name, each in captures.items() if each.utc is not None and (each.place or place)}
+    return (
+        solar
+        if 2 * len(solar) > len(captures)
+        else {name: Capture(each.local) for name, each in captures.items()}
+    )
+
+
+def _usable_views(loaded: LoadedScene) -> list[View]:
+    if not loaded.relightable:
+        return []
+    misfits = {fit.name for fit in find_misfits(read_photos(loaded.run.folder, loaded.run.step) or [])}
+    views = [view for view in loaded.scene.train_views if view.name not in misfits]
+    count = min(len(views), MAX_PHOTOS)
+    return [views[index * len(views) // count] for index in range(count)]
+
+
+def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
+    method, show = loaded.run.method, counter(progress, "looking at the light of photos")
+    rows = visible_rows(method, viewpoints_of(views))
+    found = {}
+    for number, view in enumerate(views, start=1):
+        found[view.name] = pattern_of(method.shade(encode_view(method, view)), rows)
+        show(number, len(views))
+    return found
+
+
+def _read(file: Path, step: int, timed: int | None = None) -> Day | None:
+    """What was found before for the same checkpoint and, unless None, the same number of photos with times."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        found_step, found_timed = content.pop("step"), content.pop("timed")
+        if found_step != step or timed not in (None, found_timed):
+            return None
+        return Day(**{**content, "keys": tuple(content["keys"])})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
+    """Camera centres, evenly chosen where there are many."""
+    chosen = views[:: max(1, -(-len(views) // 64))]
+    return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
+
+
+def has_day(loaded: LoadedScene) -> bool:
+    """Whether a run's light changes, and it has photos enough for a day."""
+    return len(_usable_views(loaded)) >= LEAST_PHOTOS
+
+
+def known_day(loaded: LoadedScene) -> Day | None:
+    """The day that was found for the run before, if one was."""
+    return _read(loaded.run.folder / DAY_FILE, loaded.run.step)
+
+
+def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:
+    """Whether these are several photos in the order of the day that was found for the run."""
+    day = known_day(loaded)
+    known = [day.phases[name] for name in names if name in day.phases] if day else []
+    return len(known) == len(names) > 1 and known == sorted(known)
+
+
+def start_view(loaded: LoadedScene) -> View:
+    """The photo from which the landmark is seen whole and large."""
+    views = loaded.scene.train_views or loaded.views
+    return views[choose_start([view.camera for view in views], loaded.scene.points)[0]]
+
+
+def day_timeline(
+    loaded: LoadedScene, day: Day, camera: Camera | None = None, *, progress: Progress | None = None
+) -> Timeline:
+    """The lights of a day, at a pace at which the picture changes evenly.
+
+    Args:
+        loaded: The run.
+        day: From `find_day`.
+        camera: Where the picture is looked at; None takes `start_view`.
+        progress: Called for every picture.
+    """
+    looks = tuple(loaded.appearance(name) for name in day.keys)
+    timeline = Timeline(looks)
+    camera = camera or start_view(loaded).camera
+    shrink = min(1.0, _SIDE / max(camera.width, camera.height))
+    camera = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
+    count, show = _SAMPLES * (len(looks) - 1) + 1, counter(progress, "pacing the day")
+    pictures = []
+    for number in range(count):
+        pictures.append(loaded.render(camera, timeline.at(number / max(count - 1, 1))).float())
+        show(number + 1, count)
+    changes = [float((one - other).abs().mean()) for one, other in pairwise(pictures)]
+    return timeline.paced(changes)

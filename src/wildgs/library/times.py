@@ -1,0 +1,31 @@
+"""When the photos of a run were taken, from the EXIF blocks of their files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wildgs.library.loaded import LoadedScene
+from wildgs.light.captures import Capture, read_capture
+from wildgs.scene.colmap import find_model
+
+
+def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, Capture]:
+    """Time and place of the photos whose files can be found and say so.
+
+    Args:
+        loaded: The run.
+        photos: Folder of the original photos; None looks in the scene folder of the run. Undistorted photos of
+            `wildgs sfm` have no EXIF blocks.
+    """
+    if photos is None:
+        try:
+            photos = find_model(Path(loaded.run.config.scene))[1]
+        except Exception:  # a run works without its scene folder
+            return {}
+    found = {view.name: read_capture(photos / view.name) for view in loaded.views}
+    return {name: capture for name, capture in found.items() if capture is not None}
+
+
+def read_times(loaded: LoadedScene) -> dict[str, str]:
+    """Local times in ISO 8601, by the names of photos."""
+    return {name: capture.local.isoformat() for name, capture in read_captures(loaded).items()}

@@ -1,0 +1,76 @@
+"""When and where photos were taken, as their EXIF blocks say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+_TIME = "%Y:%m:%d %H:%M:%S"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Time and place of a photo.
+
+    Attributes:
+        local: Local time by the camera's clock, without time zone.
+        utc: Time in UTC: the GPS receiver's, or that of a clock with a known zone; None where there is neither.
+        place: Latitude and longitude, degrees; None where not known.
+    """
+
+    local: datetime
+    utc: datetime | None = None
+    place: tuple[float, float] | None = None
+
+
+def read_capture(file: Path) -> Capture | None:
+    """Reads the EXIF block of a photo; None where there is none that makes sense."""
+    try:
+        with Image.open(file) as image:
+            exif = image.getexif()
+            details, gps = exif.get_ifd(IFD.Exif), exif.get_ifd(IFD.GPSInfo)
+        # `DateTime` is when the file was changed last, which says nothing about the light.
+        stamp = details.get(Base.DateTimeOriginal) or details.get(Base.DateTimeDigitized)
+        local = datetime.strptime(str(stamp).strip("\0 "), _TIME)
+        return Capture(local, _utc(gps) or _zoned(local, details), _place(gps))
+    except Exception:  # files of tourists hold anything
+        return None
+
+
+def _utc(gps: dict) -> datetime | None:
+    """The GPS receiver's clock."""
+    try:
+        hours, minutes, seconds = (float(part) for part in gps[GPS.GPSTimeStamp])
+        day = datetime.strptime(str(gps[GPS.GPSDateStamp]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
+        return day.replace(hour=int(hours), minute=int(minutes), second=int(seconds))
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _zoned(local: datetime, details: dict) -> datetime | None:
+    """The camera's clock with its zone, as `+02:00`."""
+    zone = details.get(Base.OffsetTimeOriginal) or details.get(Base.OffsetTime)
+    try:
+        return datetime.fromisoformat(f"{local.isoformat()}{str(zone).strip(chr(0) + ' ')}").astimezone(UTC)
+    except ValueError:
+        return None
+
+
+def _place(gps: dict) -> tuple[float, float] | None:
+    try:
+        latitude, longitude = (
+            sum(float(part) / 60**power for power, part in enumerate(gps[tag]))
+            * (-1 if gps[ref] in low else 1)
+            for tag, ref, low in (
+                (GPS.GPSLatitude, GPS.GPSLatitudeRef, "sS"),
+                (GPS.GPSLongitude, GPS.GPSLongitudeRef, "wW"),
+            )
+        )
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0.0, 0.0)
+    return (latitude, longitude) if valid else None

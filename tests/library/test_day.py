@@ -1,0 +1,87 @@
+"""The day of a run: found once, kept, and rendered."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+import wildgs
+from wildgs.errors import UserError
+from wildgs.library.config import TrajectoryOptions
+from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day
+
+
+@pytest.fixture(scope="module")
+def run(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(trained, tmp_path_factory.mktemp("day") / "run"))
+
+
+def test_a_day_is_found_once_and_kept(run: Path) -> None:
+    scene = wildgs.load(run)
+    (run / DAY_FILE).unlink(missing_ok=True)
+    said: list[str] = []
+    day = find_day(scene, progress=lambda what, *_: said.append(what))
+    assert set(day.phases) <= {view.name for view in scene.scene.train_views}
+    assert len(day.keys) > 2
+    assert said
+    said.clear()
+    assert find_day(scene, progress=lambda what, *_: said.append(what)) == day == known_day(scene)
+    assert not said
+    assert in_order_of_day(scene, day.keys)
+    assert not in_order_of_day(scene, day.keys[::-1])
+    content = json.loads((run / DAY_FILE).read_text(encoding="utf-8"))
+    (run / DAY_FILE).write_text(json.dumps({**content, "step": 1}), encoding="utf-8")
+    assert known_day(scene) is None
+    (run / DAY_FILE).write_text("{", encoding="utf-8")
+    assert find_day(scene) == day
+
+
+def test_times_of_the_original_photos_are_read(run: Path, tmp_path: Path) -> None:
+    scene = wildgs.load(run)
+    for number, view in enumerate(scene.views):
+        exif = Image.Exif()
+        exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = f"2020:05:01 {6 + number:02d}:00:00"
+        Image.new("RGB", (8, 6)).save(tmp_path / view.name, exif=exif)
+    day = find_day(scene, tmp_path)  # seven photos with a time are too few to be believed
+    assert not day.by_time
+
+
+def test_the_pictures_change_at_an_even_pace(run: Path) -> None:
+    scene = wildgs.load(run)
+    timeline = day_timeline(scene, find_day(scene), scene.views[0].camera)
+    frames = [frame.float() for frame in scene.frames([scene.views[0].camera] * 25, timeline)]
+    steps = np.array([float((a - b).abs().mean()) for a, b in pairwise(frames)])
+    assert steps.max() < 2 * steps.mean()
+
+
+def test_a_day_is_rendered_from_a_view_of_its_own_choice(run: Path, tmp_path: Path) -> None:
+    done = wildgs.render(
+        run, tmp_path / "frames", over="day", trajectory=TrajectoryOptions("still", 0.2, size=(24, 16))
+    )
+    assert done.pictures == len(list((tmp_path / "frames").glob("*.png"))) == 6
+    assert done.day is not None
+    assert [look.name for look in done.looks] == list(done.day.keys)
+
+
+def test_over_day_takes_no_other_light(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from wildgs.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["render", str(run), "--over", "day", "--to", "a.jpg", "--output", str(tmp_path / "a")])
+    assert ended.value.code == 2
+    assert "--over takes its light from all photos" in capsys.readouterr().err
+
+
+def test_a_run_with_one_light_has_no_day(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = wildgs.load(run)
+    monkeypatch.setattr(type(scene), "relightable", property(lambda _: False))
+    (run / DAY_FILE).unlink(missing_ok=True)
+    with pytest.raises(UserError, match="a day needs a run whose light changes"):
+        find_day(scene)

@@ -1,0 +1,152 @@
+"""The order of a day: by the sun, by light, and with clocks that are wrong."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+from scipy.stats import kendalltau
+
+from wildgs.light.captures import Capture, read_capture
+from wildgs.light.day import KEYS, LEAST_PHOTOS, Pattern, plan_day
+from wildgs.light.sun import phase_of, sun_position
+
+BERLIN = (52.5163, 13.3777)
+
+
+@pytest.mark.parametrize(
+    ("utc", "place", "elevation"),
+    [
+        # Overhead at the equator at equinox; 90 - latitude + 23.44 degrees high at noon of the solstice.
+        (datetime(2024, 3, 20, 12, 7, tzinfo=UTC), (0.0, 0.0), 90.0),
+        (datetime(2024, 6, 20, 12, 2, tzinfo=UTC), (51.4769, 0.0), 90 - 51.4769 + 23.44),
+        (datetime(2024, 12, 21, 11, 58, tzinfo=UTC), (51.4769, 0.0), 90 - 51.4769 - 23.44),
+        (datetime(2024, 6, 20, 23, 58, tzinfo=UTC), (90.0, 0.0), 23.44),
+    ],
+)
+def test_the_sun_stands_where_almanacs_say(utc: datetime, place: tuple, elevation: float) -> None:
+    assert sun_position(utc, *place)[0] == pytest.approx(elevation, abs=0.5)
+
+
+def test_the_sun_rises_before_noon_and_sets_after_it() -> None:
+    day = datetime(2024, 5, 1, tzinfo=UTC)
+    phases = [
+        phase_of(Capture(day.replace(tzinfo=None), day + timedelta(hours=hour), BERLIN))
+        for hour in range(1, 23)
+    ]
+    assert phases == sorted(phases)
+    assert phases[0] < 0
+    assert phases[-1] > 170
+
+
+def test_a_clock_without_place_counts_from_six_to_six() -> None:
+    hours = {6: 0.0, 12: 90.0, 18: 180.0, 1: 285.0}
+    for hour, phase in hours.items():
+        assert phase_of(Capture(datetime(2019, 7, 1, hour, 0))) == phase
+
+
+def _photo(file: Path) -> Path:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif).update(
+        {Base.DateTimeOriginal: "2019:07:01 19:30:00", Base.OffsetTimeOriginal: "+02:00"}
+    )
+    gps = {GPS.GPSLatitudeRef: "N", GPS.GPSLatitude: (52.0, 30.0, Fraction(3600, 100)),
+           GPS.GPSLongitudeRef: "W", GPS.GPSLongitude: (13.0, 15.0, 0.0)}  # fmt: skip
+    exif.get_ifd(IFD.GPSInfo).update(gps)
+    Image.new("RGB", (8, 6)).save(file, exif=exif)
+    return file
+
+
+def test_time_zone_and_place_are_read(tmp_path: Path) -> None:
+    capture = read_capture(_photo(tmp_path / "a.jpg"))
+    assert capture is not None
+    assert capture.local == datetime(2019, 7, 1, 19, 30)
+    assert capture.utc == datetime(2019, 7, 1, 17, 30, tzinfo=UTC)
+    assert capture.place == pytest.approx((52.51, -13.25))
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", b"\xff\xd8\xff\xe1\x00\x10Exif\x00\x00broken"])
+def test_files_without_a_time_have_none(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.jpg").write_bytes(content)
+    assert read_capture(tmp_path / "a.jpg") is None
+    Image.new("RGB", (4, 4)).save(tmp_path / "b.jpg")
+    assert read_capture(tmp_path / "b.jpg") is None
+    assert read_capture(tmp_path / "nothing.jpg") is None
+
+
+def _world(photos: int = 40, seed: int = 0) -> tuple[dict[str, Pattern], dict[str, float]]:
+    """A box under a sun that rises on one side: lit by its height and side, with exposures at random."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    albedo = rng.uniform(0.2, 0.9, 500)
+    patterns, phases = {}, {}
+    for number in range(photos):
+        phase = rng.uniform(2, 178)
+        height = np.radians(min(phase, 180 - phase))
+        side = -np.cos(height) if phase < 90 else np.cos(height)
+        lit = np.clip(normals @ np.array([side, 0.0, np.sin(height)]), 0, None)
+        light = 0.3 * np.array([0.9, 1, 1.2]) + lit[:, None] * np.sin(height) ** 0.3 * np.array(
+            [1.2, 1.0, 0.3 + 0.6 * np.sin(height)]
+        )
+        color = albedo[:, None] * light * np.exp(rng.normal(0, 0.3))
+        log = np.log(color @ np.array([0.2126, 0.7152, 0.0722]))
+        log += rng.normal(0, 0.05, 500)
+        name = f"{number}.jpg"
+        patterns[name] = Pattern(log - log.mean(), np.log(color[:, 0] / color[:, 2]), float(log.mean()))
+        phases[name] = phase
+    return patterns, phases
+
+
+def test_photos_are_ordered_by_their_times_and_wrong_clocks_are_named() -> None:
+    patterns, truth = _world()
+    wrong = sorted(truth, key=lambda name: abs(truth[name] - 90))[:3] + sorted(truth, key=truth.get)[:2]
+    told = truth | dict.fromkeys(wrong[:3], -20.0) | dict.fromkeys(wrong[3:], 88.0)
+    day = plan_day(patterns, told)
+    assert day is not None
+    assert day.by_time
+    assert set(day.left_out) >= set(wrong)
+    assert len(day.left_out) <= len(wrong) + 2
+    assert list(day.phases.values()) == sorted(day.phases.values())
+    assert kendalltau(list(day.phases.values()), [truth[name] for name in day.phases])[0] > 0.99
+    assert not set(day.keys) & set(wrong)
+
+
+def test_without_times_light_alone_finds_the_height_of_the_sun() -> None:
+    patterns, truth = _world()
+    day = plan_day(patterns, {})
+    assert day is not None
+    assert not day.by_time
+    heights = [90 - abs(phase - 90) for phase in day.phases.values()]
+    tau = kendalltau(heights, [90 - abs(truth[name] - 90) for name in day.phases])[0]
+    assert tau > 0.8
+
+
+def test_times_that_say_nothing_about_the_light_are_not_believed() -> None:
+    patterns, _ = _world()
+    rng = np.random.default_rng(3)
+    day = plan_day(patterns, {name: float(rng.uniform(0, 180)) for name in patterns})
+    assert day is not None
+    assert not day.by_time
+    assert not day.left_out
+
+
+def test_keys_are_few_in_order_and_reach_from_end_to_end() -> None:
+    patterns, truth = _world()
+    day = plan_day(patterns, truth)
+    assert day is not None
+    phases = [day.phases[key] for key in day.keys]
+    assert phases == sorted(phases)
+    assert LEAST_PHOTOS <= len(phases) <= KEYS
+    assert phases[0] < 30
+    assert phases[-1] > 150
+
+
+def test_a_few_photos_have_no_day() -> None:
+    patterns, _ = _world(LEAST_PHOTOS - 1)
+    assert plan_day(patterns, {}) is None
