@@ -185,3 +185,15 @@ def test_restored_statistics_are_where_the_gaussians_are() -> None:
     control = DensityControl(DensityConfig(), 1.0, 5, "meta")
     control.restore(DensityControl(DensityConfig(), 1.0, 5).state())
     assert {value.device.type for value in control.state().values()} == {"meta"}
+
+
+def test_what_may_not_grow_is_neither_pruned_nor_reset(method: VanillaGS) -> None:
+    control, optimizers = controlled(method, [0.0] * 4, prune_opacity=2.0)
+    means, before = method.gaussians.means.detach().clone(), method.gaussians.opacities.detach().clone()
+    growable = torch.tensor([True, False, True, False])
+    control.reset_opacity(method.gaussians, optimizers.rows, growable)
+    expected = torch.where(growable, before.clamp(max=0.01), before)
+    torch.testing.assert_close(method.gaussians.opacities.detach(), expected)
+    generator = torch.Generator().manual_seed(0)
+    control.densify(method.gaussians, optimizers.rows, generator, prune_large=True, growable=growable)
+    assert torch.equal(method.gaussians.means.detach(), means[[1, 3]])

@@ -140,7 +140,7 @@ class DensityControl:
             optimizer: Edited alike.
             generator: Draws the split positions.
             prune_large: Whether oversized Gaussians go as well.
-            growable: Which Gaussians may be cloned and split; None for all.
+            growable: Which Gaussians may be cloned, split and pruned; None for all.
             sort: Whether to leave the Gaussians in Morton order.
         """
         scales = gaussians.scales
@@ -151,6 +151,8 @@ class DensityControl:
         prune = gaussians.opacities < self.config.prune_opacity
         if prune_large:
             prune = prune | self._select_large(gaussians, largest)
+        if growable is not None:
+            prune = prune & growable
         finite = torch.isfinite(gaussians.means).all(dim=-1) & torch.isfinite(largest)
         prune = prune | ~finite
         clones, splits = clones & ~prune, splits & ~prune
@@ -222,12 +224,25 @@ class DensityControl:
         return excess
 
     @torch.no_grad()
-    def reset_opacity(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Lowers opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned."""
+    def reset_opacity(
+        self,
+        gaussians: Gaussians,
+        optimizer: torch.optim.Optimizer,
+        growable: Bool[Tensor, "N"] | None = None,
+    ) -> None:
+        """Lowers opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned.
+
+        Args:
+            gaussians: Edited in place.
+            optimizer: Whose moments of the opacities are cleared.
+            growable: Which Gaussians may be pruned, and so are reset; None for all.
+        """
         logits = gaussians.rows["opacity_logits"]
         lowered = logits.clamp(max=float(torch.tensor(self.config.reset_opacity).logit()))
         moments = optimizer.state.get(gaussians.means, {}).get("exp_avg_sq")
         if moments is not None and not self.config.reset_unseen:
             lowered = torch.where((moments == 0).all(dim=1), logits, lowered)
+        if growable is not None:
+            lowered = torch.where(growable, lowered, logits)
         logits.copy_(lowered)
         reset_moments(optimizer, gaussians, "opacity_logits")

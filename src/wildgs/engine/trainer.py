@@ -256,7 +256,7 @@ class Trainer:
         report = None
         # Before densification, whose new Gaussians look as if no photo had ever shown them.
         if self.schedule.resets(self.step, taken):
-            self.density.reset_opacity(self.method.gaussians, self.optimizers.rows)
+            self.density.reset_opacity(self.method.gaussians, self.optimizers.rows, self.method.growable())
         if self.schedule.densifies(self.step, taken):
             large = 0 < self.schedule.reset_every < self.step
             report = self.density.densify(

@@ -114,7 +114,7 @@ class Method(nn.Module, ABC):
         return None
 
     def growable(self) -> Bool[Tensor, " N"] | None:
-        """Which Gaussians densification may clone and split; None for all."""
+        """Which Gaussians densification may clone, split, reset and prune; None for all."""
         return None
 
     # Encode, shade, render.

@@ -120,4 +120,6 @@ def make_camera(where: str, camera_id: int, model: str, width: int, height: int,
             camera_id=camera_id, model=model, width=width, height=height, params=np.array(params)
         )
     except Exception as error:  # pycolmap raises many kinds
-        raise ModelFileError(f"{where}: camera {camera_id} has parameters that are invalid for model {model}") from error
+        raise ModelFileError(
+            f"{where}: camera {camera_id} has parameters that are invalid for model {model}"
+        ) from error
