@@ -246,6 +246,7 @@ class Trainer:
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
+            metric_depth=self.feed.depth(view) if self.method.depth_supervised else None,
             observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,
