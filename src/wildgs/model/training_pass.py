@@ -21,12 +21,16 @@ class Stage:
         learn_mask: Whether the visibility mask takes gradients now.
         sh_degree: Active degree of the spherical harmonics.
         learn_encoder: Whether the photo's encoder takes gradients now.
+        dropout: Share of the Gaussians that is left out now (see `wildgs.model.dropout`).
+        neighbours: Gaussians that are left out together.
     """
 
     explicit: bool = True
     learn_mask: bool = True
     sh_degree: int = 3
     learn_encoder: bool = True
+    dropout: float = 0.0
+    neighbours: int = 8
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,8 @@ def agreed_depth(
 ) -> Float32[np.ndarray, "H W"]:
     """Depth of a photo where enough neighbours agree."""
     _, width, height = level.layout[photo]
+    if not others:
+        return np.zeros((height, width), np.float32)
     inverse, agreeing = np.empty((height, width), np.float32), np.empty((height, width), np.int32)
     launch(
         count_agreeing,

@@ -62,7 +62,7 @@ class Level:
         """The same photos at half the size."""
         cameras, pictures = [], []
         for camera, (start, width, height) in zip(self.cameras, self.layout, strict=True):
-            size = (max(1, height // 2), max(1, width // 2))
+            size = (max(1, camera.height // 2), max(1, camera.width // 2))
             picture = torch.from_numpy(self.pixels[start : start + width * height].reshape(height, width))
             pictures.append(adaptive_avg_pool2d(picture[None], size)[0].numpy())
             cameras.append(camera.resized(size[1], size[0]))

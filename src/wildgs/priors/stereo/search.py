@@ -44,7 +44,7 @@ class Search:
 
     photo: int
     others: list[int]
-    guesses: Float32[np.ndarray, "H W G"]
+    guesses: Float32[np.ndarray, "h w G"]
     bounds: Float32[np.ndarray, "2"]
     up: Float32[np.ndarray, "3"]
     mask: UInt8[np.ndarray, "H W"] | None
