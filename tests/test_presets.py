@@ -33,7 +33,6 @@ MENDED = {
     "model.matched_loss": 0.0,
     "train.objective.depth_weight": 0.05,
     "train.objective.metric_weight": 0.0,
-    "train.dropout.rate": 0.0,
     "train.schedule.encoder_every": 1,
     "train.optimizer.short_runs": 0.0,
     "train.density.prune_by_distance": False,

@@ -281,11 +281,12 @@ class DropoutConfig:
 
     Attributes:
         rate: Share of the Gaussians that is left out at the end of training, with few photos; it grows linearly.
+            0 leaves none out.
         photos: From so many training photos on nothing is left out; half as many halve the rate.
         neighbours: Gaussians that are left out together.
     """
 
-    rate: float = 0.1
+    rate: float = 0.0
     photos: int = 50
     neighbours: int = 8
 
