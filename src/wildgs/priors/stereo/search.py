@@ -24,8 +24,11 @@ _GUESSES = 4
 _DRAWS = 16
 _COARSE_SPREADS = (0.1, 0.05, 0.03, 0.02)
 _FINE_SPREADS = (0.02, 0.005)
-_MARGIN = 2.0
-"""How many times nearer or farther surfaces may be than the points that a photo observes."""
+_NEARER, _FARTHER = 2.0, 50.0
+"""How many times nearer or farther surfaces may be than the points that a photo observes.
+
+The background may be far off; left out, it would match at some wrong, nearer depth.
+"""
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ class Search:
         nearness = 1 / view.camera.project(seen)[1].double()
         guesses = _guesses(camera, seen, ground)
         low, high = (float(nearness.quantile(share)) for share in (0.01, 0.99))
-        bounds = np.array([low / _MARGIN, max(high, float(guesses.max())) * _MARGIN], np.float32)
+        bounds = np.array([low / _FARTHER, max(high, float(guesses.max())) * _NEARER], np.float32)
         up = view.camera.viewmat[:3, 2].numpy().astype(np.float32)
         mask = view.read_mask()
         return cls(photo, others, guesses, bounds, up, None if mask is None else mask.numpy(), seed)
