@@ -298,7 +298,7 @@ class ScenePhotos(PhotoStore):
         except UnreadableImageError as error:
             self._without_depth.add(path)
             warnings.warn(
-                f"{path}: {error}; this photo trains without it (delete the file and run `wildgs depth`)",
+                f"{path}: {error}; this photo trains without depth (delete the file and run `wildgs depth`)",
                 WildGSWarning,
                 stacklevel=2,
             )
