@@ -85,12 +85,13 @@ def make_scene(tmp_path: Path) -> Callable[..., Path]:
         images: str = "images",
         names: Sequence[str] | None = None,
         points: np.ndarray | None = None,
+        poses: Sequence[np.ndarray] | None = None,
         **model: object,
     ) -> Path:
         root = tmp_path / "scene"
         names = names or [f"p{index:02d}.png" for index in range(count)]
         points = ground_points() if points is None else points
-        write_model(root / layout, names, ring_poses(len(names)), points, **model)
+        write_model(root / layout, names, poses or ring_poses(len(names)), points, **model)
         for name in names:
             path = root / images / name
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -36,6 +36,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.optimizer.short_runs": (0, 1),
     "train.density.reset_opacity": (1e-6, 1),
     "train.density.max_gaussians": (1, _MOST),
+    "train.dropout.rate": (0, 0.9),
+    "train.dropout.neighbours": (1, 1024),
     "model.mask_threshold": (0, 1),
     "model.matched_loss": (0, 1),
     "model.light_codes": (0, 64),

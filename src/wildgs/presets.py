@@ -44,6 +44,7 @@ _PAPER: dict[str, Any] = {
     "model.light_components": 0,
     "model.matched_loss": 0.0,
     "train.objective.depth_weight": 0.05,
+    "train.objective.metric_weight": 0.0,
     "train.schedule.encoder_every": 1,
     "train.schedule.mask_every": 1,
     "train.schedule.planes_every": 1,

@@ -8,6 +8,7 @@ from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
 from wildgs.config import RunConfig, write_config
 from wildgs.library import pipeline
+from wildgs.priors.config import StereoConfig
 from wildgs.priors.depth import DepthEstimator
 from wildgs.sfm import reconstruction
 from wildgs.sfm.report import SfmReport
@@ -77,6 +78,20 @@ def test_depth_reports_what_it_wrote(
     depth.run(depth.Command(tmp_path, model="here", device="cpu"))
     assert asked == {"source": "here", "device": "cpu", "required": True}
     assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_depth_by_stereo_needs_no_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fill(root: Path, config: StereoConfig, *, holdout: int, overwrite: bool, progress) -> tuple[int, int]:
+        assert (root, config.max_side, holdout, overwrite) == (tmp_path, 200, 5, True)
+        return 4, 0
+
+    monkeypatch.setattr(pipeline, "load_depth_anything", None)
+    monkeypatch.setattr(pipeline, "fill_metric_folder", fill)
+    arguments = ["--by", "stereo", "--holdout", "5", "--stereo.max-side", "200", "--overwrite"]
+    wildgs(["depth", str(tmp_path), *arguments])
+    assert "4 written, 0 there before" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(

@@ -1,7 +1,14 @@
 import pytest
 import torch
 
-from wildgs.losses.objective import ObjectiveConfig, depth_correlation, total_loss, visibility_regularizer
+from wildgs.losses.objective import (
+    OUTLYING,
+    ObjectiveConfig,
+    depth_correlation,
+    metric_error,
+    total_loss,
+    visibility_regularizer,
+)
 from wildgs.losses.photometric import masked_photometric
 from wildgs.losses.ssim import ssim_map
 
@@ -114,3 +121,33 @@ def test_either_gradient_of_the_mask_belongs_to_one_value(inputs):
     assert losses["loss"].as_floats() == pytest.approx(losses["evidence"].as_floats(), rel=1e-5)
     by_mask = {k: torch.autograd.grad(v.image, [inputs["visibility"]])[0] for k, v in losses.items()}
     assert not torch.allclose(by_mask["loss"], by_mask["evidence"], atol=1e-4)
+
+
+def test_metric_error_is_that_of_inverse_depth_and_bounded() -> None:
+    known = torch.tensor([[2.0, 2.0, 0.0, 2.0]])
+    everywhere = torch.ones(1, 4, dtype=torch.bool)
+    assert float(metric_error(known, known, everywhere)) == 0.0
+    rendered = torch.tensor([[2.0 / 1.05, 1e-3, 5.0, 2.0]], requires_grad=True)
+    error = metric_error(rendered, known, everywhere)
+    expected = (0.05 / 1.5 + OUTLYING * (1999 / (1999 + OUTLYING))) / 4
+    assert float(error.detach()) == pytest.approx(expected, rel=1e-3)
+    error.backward()
+    assert rendered.grad is not None
+    assert rendered.grad[0, 0] < 0  # towards the known depth
+    assert rendered.grad[0, 2] == 0  # nothing is known there
+    assert float(metric_error(rendered, known, ~everywhere).detach()) == 0.0
+
+
+def test_metric_depth_takes_the_place_of_the_monocular_estimate() -> None:
+    generator = torch.Generator().manual_seed(0)
+    photo, depth = torch.rand(16, 16, 3, generator=generator), 1 + torch.rand(16, 16, generator=generator)
+    metric = torch.zeros(16, 16)
+    metric[:8] = depth[:8]
+    disparity = 1 / depth
+    disparity[:8] = depth[:8]  # wrong where metric depth is known: it must not count there
+    config = ObjectiveConfig(depth_weight=0.3, metric_weight=0.7)
+    both = total_loss(config, 0.0, photo, photo, depth=depth, disparity=disparity, metric_depth=metric)
+    lower = total_loss(config, 0.0, photo[8:], photo[8:], depth=depth[8:], disparity=disparity[8:])
+    torch.testing.assert_close(both.depth, lower.depth)
+    without = total_loss(config, 0.0, photo, photo, depth=2 * depth, metric_depth=metric)
+    torch.testing.assert_close(without.total, 0.7 * without.depth + without.image)

@@ -133,3 +133,20 @@ def test_the_fit_finds_scale_and_shift_among_outliers(
 def test_far_that_is_large_is_no_disparity() -> None:
     inverse = torch.linspace(0.2, 1, 100)
     assert fit_disparity(1 - inverse, inverse, torch.Generator().manual_seed(0)) is None
+
+
+def test_metric_depth_of_one_photo_is_enough_and_brings_its_disparity_to_scale() -> None:
+    depth = relief()
+    metric = depth.clone()
+    metric[:, SIDE // 2 :] = 0
+    points, _ = depth_points(
+        scene([with_photos(view(2, depth), disparity=None, depth=metric.numpy())]), CONFIG
+    )
+    assert len(points) > 100
+    assert points[:, 0].max() < 0.1
+    assert (points[points[:, 1] > 0.05, 2] - WALL).abs().max() < 0.02
+    several = [with_photos(view(index, depth), depth=metric.numpy()) for index in range(5)]
+    filled, _ = depth_points(scene(several), CONFIG)
+    right = filled[(filled[:, 0] > 0.1) & (filled[:, 1] > 0.05)]
+    assert len(right) > 20
+    assert (right[:, 2] - WALL).abs().max() < 0.05

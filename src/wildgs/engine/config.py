@@ -7,7 +7,7 @@ from typing import Literal
 
 from wildgs.errors import UserError
 from wildgs.losses.config import ObjectiveConfig
-from wildgs.model.config import Precision
+from wildgs.model.config import DropoutConfig, Precision
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,7 @@ class TrainConfig:
         schedule: Training schedule.
         optimizer: Learning rates.
         density: Densification and pruning.
+        dropout: Dropout of Gaussians, for scenes of few photos.
     """
 
     steps: int = 30_000
@@ -124,6 +125,7 @@ class TrainConfig:
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+    dropout: DropoutConfig = field(default_factory=DropoutConfig)
 
     def __post_init__(self) -> None:
         """Refuses a run without a step."""

@@ -134,6 +134,11 @@ class PhotoFeed:
         disparity = view.read_disparity()
         return None if disparity is None else upload(disparity, self.device)
 
+    def depth(self, view: View) -> Float[Tensor, "H W"] | None:
+        """The metric depth, where there is any."""
+        depth = view.read_depth()
+        return None if depth is None else upload(depth, self.device)
+
     def observations(self, view: View) -> Float[Tensor, "K 2"] | None:
         """Pixels (x, y) at which the photo shows triangulated points, where that is known."""
         return self._observations.get(view.name)

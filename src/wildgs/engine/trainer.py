@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -234,6 +234,9 @@ class Trainer:
     def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
         photo, keep = self.feed.photo(view)
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
+        dropout = self.config.dropout
+        rate = dropout.rate_at(self.schedule.progress(self.step), len(self.views))
+        stage = replace(stage, dropout=rate, neighbours=dropout.neighbours)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
@@ -246,6 +249,7 @@ class Trainer:
             depth=output.rendering.depth,
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
+            metric_depth=self.feed.depth(view) if self.method.depth_supervised else None,
             observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,

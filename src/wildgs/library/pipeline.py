@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from wildgs.config import ExecutionConfig, RunConfig, read_config, with_entries
 from wildgs.engine.config import DensityConfig, TrainConfig
@@ -21,7 +22,9 @@ from wildgs.library.pages import write_scene_page, write_showcase
 from wildgs.library.training import read_scene, train
 from wildgs.model.config import ParsingConfig, WildGSConfig
 from wildgs.model.registry import MethodName, method_type
+from wildgs.priors.config import StereoConfig
 from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
+from wildgs.priors.stereo.depth import fill_metric_folder
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
@@ -93,6 +96,8 @@ def run(
         scene_folder = output / "scene"
         _pose(photos, scene_folder, sfm, progress)
         if not (output / CONFIG_FILE).is_file():
+            given = DataConfig().holdout if holdout is None else holdout
+            estimate_depth(scene_folder, by="stereo", holdout=given, progress=progress)
             _estimate_depth_if_possible(scene_folder, progress)
         size = _photo_size(output, max_side, downscale)
         config = _configure(scene_folder, output / CONFIG_FILE, steps, size, max_gaussians, holdout)
@@ -161,18 +166,25 @@ class EstimatedDepth:
 def estimate_depth(
     scene: str | Path,
     *,
+    by: Literal["network", "stereo"] = "network",
     model: str = DEPTH_ANYTHING,
+    stereo: StereoConfig | None = None,
+    holdout: int = DataConfig().holdout,
     overwrite: bool = False,
     device: str | None = None,
     progress: Progress | None = None,
 ) -> EstimatedDepth:
-    """Estimates the disparity of every photo of a scene, written to SCENE/depth/ as 16-bit pictures.
+    """Estimates the depth of the photos of a scene, written to SCENE/depth/.
 
     Args:
         scene: Folder of a COLMAP scene.
+        by: 'network': disparity of every photo by Depth Anything, as 16-bit pictures. 'stereo': metric depth of the
+            training photos by multi-view stereo, as 32-bit floats in units of the model.
         model: Folder of the network in the hub's layout, or its name on the hub.
+        stereo: Options of stereo.
+        holdout: Every n-th photo is held out where the scene has no .tsv split: stereo does not look at it.
         overwrite: Estimate again what is already there.
-        device: `cpu` or `cuda`; by default CUDA where there is one.
+        device: `cpu` or `cuda`, for the network; by default CUDA where there is one.
         progress: Called for every photo.
 
     Raises:
@@ -181,6 +193,12 @@ def estimate_depth(
     scene = Path(scene)
     if not scene.is_dir():
         raise UserError(f"{scene}: no such folder; give the folder of a COLMAP scene")
+    if by == "stereo":
+        show = counter(progress, "comparing photos")
+        written, kept = fill_metric_folder(
+            scene, stereo or StereoConfig(), holdout=holdout, overwrite=overwrite, progress=show
+        )
+        return EstimatedDepth(scene / "depth", written, kept)
     estimator = load_depth_anything(model, device=device, required=True)
     assert estimator is not None  # `required` raises otherwise
     show = counter(progress, "estimating depth")

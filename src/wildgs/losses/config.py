@@ -15,6 +15,7 @@ class ObjectiveConfig:
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
         depth_weight: λ^D (paper: 0.05).
+        metric_weight: Weight of the error against metric depth, where there is any. Not in the paper.
         mask_gradient: What the mask learns from in the image loss. 'loss': the formula's own gradient, as printed;
             'evidence': what the pixel shows (`wildgs.losses.photometric.transient_evidence`). The value of the loss
             and its gradient to the render are the same.
@@ -25,6 +26,7 @@ class ObjectiveConfig:
     mask_weight_start: float = 0.4
     mask_weight_end: float = 0.1
     depth_weight: float = 0.01
+    metric_weight: float = 0.1
     mask_gradient: Literal["evidence", "loss"] = "evidence"
     min_alpha: float = 0.5
 

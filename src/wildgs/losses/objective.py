@@ -21,8 +21,8 @@ class Losses:
     Attributes:
         image: L^I.
         mask: L^M; 0 where there is no mask to learn.
-        depth: L^D; 0 where there is no estimate.
-        total: ``L^I + λ^M L^M + λ^D L^D``, to be differentiated.
+        depth: L^D and the error against metric depth; 0 where there is no estimate.
+        total: ``L^I + λ^M L^M + λ^D L^D`` and the weighted error against metric depth, to be differentiated.
     """
 
     NAMES: ClassVar[tuple[str, ...]] = ("image", "mask", "depth", "total")
@@ -57,6 +57,7 @@ def total_loss(
     depth: Float[Tensor, "H W"] | None = None,
     alpha: Float[Tensor, "H W"] | None = None,
     disparity: Float[Tensor, "H W"] | None = None,
+    metric_depth: Float[Tensor, "H W"] | None = None,
     observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
@@ -73,6 +74,8 @@ def total_loss(
         depth: Rendered expected depth; the depth loss needs it and `disparity`.
         alpha: Accumulated alpha of the render; pixels below `min_alpha` are left out of the depth loss.
         disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
+        metric_depth: Depth in world units, 0 where there is none: where it is known, it takes the place of the
+            monocular estimate.
         observations: Pixels (x, y) at which the photo shows triangulated points: the mask learns that these are
             static.
         train_mask: False passes no gradient to the mask (the pause after an opacity reset).
@@ -90,14 +93,19 @@ def total_loss(
     if visibility is not None:
         mask = visibility_regularizer(visibility if keep is None else torch.where(keep, visibility, 1.0))
         total = total + config.mask_weight(progress) * mask
-    if depth is not None and disparity is not None:
+    if depth is not None and (disparity is not None or metric_depth is not None):
         selection = torch.ones_like(depth, dtype=torch.bool) if keep is None else keep
         if visibility is not None:
             selection = selection & (visibility.detach() > mask_threshold)
         if alpha is not None:
             selection = selection & (alpha.detach() > config.min_alpha)
-        depth_term = depth_correlation(depth, disparity, selection)
-        total = total + config.depth_weight * depth_term
+        if metric_depth is not None:
+            error = metric_error(depth, metric_depth, selection)
+            depth_term, total = depth_term + error, total + config.metric_weight * error
+            selection = selection & (metric_depth == 0)
+        if disparity is not None:
+            correlation = depth_correlation(depth, disparity, selection)
+            depth_term, total = depth_term + correlation, total + config.depth_weight * correlation
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
 
 
@@ -128,6 +136,29 @@ def visibility_regularizer(visibility: Float[Tensor, "H W"]) -> Float[Tensor, ""
         0 where all is visible, 1 where all is hidden.
     """
     return (1 - visibility).square().mean()
+
+
+OUTLYING = 0.1
+"""Share of the depth beyond which an error says more about the estimate than about the render."""
+
+
+def metric_error(
+    depth: Float[Tensor, "H W"], known: Float[Tensor, "H W"], selection: Bool[Tensor, "H W"]
+) -> Float[Tensor, ""]:
+    """Mean of ``e / (1 + e / OUTLYING)``, ``e = |known / depth - 1|`` being the relative error of inverse depth.
+
+    Args:
+        depth: Rendered expected depth, world units along the camera's z axis.
+        known: Estimate in the same units; 0 where there is none.
+        selection: Pixels that count. Passes no gradient.
+
+    Returns:
+        0 (equal) to `OUTLYING`; 0 where no pixel counts. The mean is over all pixels of the picture, so that photos
+        of which little is known weigh little.
+    """
+    chosen = selection & (known > 0) & (depth.detach() > 0)
+    error = (known / torch.where(chosen, depth, 1.0) - 1).abs()
+    return torch.where(chosen, error / (1 + error / OUTLYING), 0.0).mean()
 
 
 MIN_PIXELS = 64

@@ -285,3 +285,29 @@ class VanillaConfig:
     """
 
     learning_rates: VanillaRates = field(default_factory=VanillaRates)
+
+
+@dataclass(frozen=True)
+class DropoutConfig:
+    """Dropout of Gaussians in training (`wildgs.model.dropout`). Not in the paper.
+
+    Attributes:
+        rate: Share of the Gaussians that is left out at the end of training, with few photos; it grows linearly.
+            0 leaves none out.
+        photos: From so many training photos on nothing is left out; half as many halve the rate.
+        neighbours: Gaussians that are left out together.
+    """
+
+    rate: float = 0.0
+    photos: int = 50
+    neighbours: int = 8
+
+    def rate_at(self, progress: float, photos: int) -> float:
+        """Share of the Gaussians that is left out.
+
+        Args:
+            progress: Share of the training done, 0 to 1.
+            photos: Training photos.
+        """
+        few = 1.0 - photos / self.photos if self.photos else 0.0
+        return self.rate * min(max(progress, 0.0), 1.0) * max(0.0, few)

@@ -65,11 +65,12 @@ class Gaussians(nn.Module):
         """Opacities in (0, 1)."""
         return self.rows["opacity_logits"].sigmoid()
 
-    def project(self, camera: Camera, *, absgrad: bool = False) -> Projection:
-        """Projects and bins all Gaussians for one camera."""
-        return project(
-            self.means, self.quats, self.scales, self.opacities, camera, near=NEAR, absgrad=absgrad
-        )
+    def project(
+        self, camera: Camera, *, absgrad: bool = False, factors: Float[Tensor, "N"] | None = None
+    ) -> Projection:
+        """Projects and bins all Gaussians for one camera; `factors` multiply their opacities, up to 0.999."""
+        opacities = self.opacities if factors is None else (self.opacities * factors).clamp(max=0.999)
+        return project(self.means, self.quats, self.scales, opacities, camera, near=NEAR, absgrad=absgrad)
 
 
 def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:

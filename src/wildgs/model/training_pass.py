@@ -22,6 +22,8 @@ class Stage:
         sh_degree: Active degree of the spherical harmonics.
         learn_encoder: Whether the photo's encoder takes gradients now.
         learn_planes: Whether the triplane's UNet takes gradients now.
+        dropout: Share of the Gaussians that is left out now (see `wildgs.model.dropout`).
+        neighbours: Gaussians that are left out together.
     """
 
     explicit: bool = True
@@ -29,6 +31,8 @@ class Stage:
     sh_degree: int = 3
     learn_encoder: bool = True
     learn_planes: bool = True
+    dropout: float = 0.0
+    neighbours: int = 8
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch import Tensor
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
+from wildgs.model.dropout import opacity_factors
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, rows_to_shade, spread_rows, take_rows
@@ -303,7 +304,10 @@ class WildGS(Method):
         appearance = self.parse(
             photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask, name=name
         )
-        projection = self.gaussians.project(camera)
+        factors = None
+        if stage.dropout > 0:
+            factors = opacity_factors(self.num_gaussians, stage.dropout, stage.neighbours, photo.device)
+        projection = self.gaussians.project(camera, factors=factors)
         projection.means2d.retain_grad()
         if stage.explicit and self._wraps:
             with torch.set_grad_enabled(torch.is_grad_enabled() and stage.learn_planes):

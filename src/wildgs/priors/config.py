@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from wildgs.errors import UserError
+
 DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 
 
@@ -41,3 +43,34 @@ class GroundConfig:
     spacing: float = 0.04
     reach: float = 1.0
     tolerance: float = 0.03
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """Depth by multi-view stereo.
+
+    Attributes:
+        max_side: Photos are compared at this size (longer side), pixels.
+        neighbours: Photos with which each is compared, at most.
+        agreeing: Neighbours that have to see the surface where a photo sees it.
+        max_cost: 1 - NCC of a window beyond which nothing is said.
+        tolerance: Difference of depth within which photos agree, as a share of it.
+        reach: Pixels within which a point carried to a neighbour and back has to arrive.
+        support: Pixels of the 7 x 7 around a pixel that its plane has to hold for.
+        seed: Of random planes.
+    """
+
+    max_side: int = 400
+    neighbours: int = 6
+    agreeing: int = 2
+    max_cost: float = 0.8
+    tolerance: float = 0.015
+    reach: float = 1.5
+    support: int = 16
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses values with which nothing can be compared."""
+        for name, least in (("max_side", 32), ("neighbours", 1), ("agreeing", 1)):
+            if getattr(self, name) < least:
+                raise UserError(f"stereo.{name} {getattr(self, name)}: must be {least} or more")

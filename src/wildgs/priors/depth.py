@@ -103,7 +103,8 @@ def load_depth_anything(
     if model is None:
         message = (
             f"Depth Anything ({source}) is neither a folder, nor cached, nor to be had from the hub: there is"
-            f" no depth prior but what depth/ holds; get it with `hf download {source}` or give its folder"
+            f" no depth prior but what depth/ holds; get it with `hf download {source}`, give its folder,"
+            " or use `wildgs depth --by stereo`"
         )
         if required:
             raise UserError(message)

@@ -1,4 +1,4 @@
-"""Points where structure from motion found none: from the photos' depth priors, brought to the scene's scale.
+"""Points where structure from motion found none: from metric depth and from depth priors, brought to its scale.
 
 Paving, lawns and bare walls have no features that SIFT could match between photos of different light, so no
 Gaussian starts there; a monocular network sees them all the same. Each photo's disparity is fitted to the SfM
@@ -7,7 +7,7 @@ points that the photo sees, and only what several photos agree on is kept, so th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +21,9 @@ from wildgs.scene.scene import Scene, View
 MAX_PHOTOS = 200
 """Photos that are asked; of larger scenes evenly many over the list."""
 
+METRIC_VOTES = 3
+METRIC_CELL = 0.5
+"""Side of the cells of metric depth, as a share of those in which depth priors have to agree."""
 _HYPOTHESES = 256
 _TOLERANCE = 0.05
 _MIN_POINTS, _MIN_INLIERS = 24, 0.4
@@ -30,13 +33,17 @@ _MIN_CORRELATION = 0.7  # where all is about as far, a constant fits, and says n
 
 @dataclass(frozen=True)
 class _Seen:
-    """What one photo says: some of its pixels as points, and its depth at every `step`-th pixel, 0 for nothing."""
+    """What one photo says: some of its pixels as points, and its depth at every `step`-th pixel, 0 for nothing.
+
+    Metric depth has `METRIC_VOTES`: photos agreed on it already.
+    """
 
     points: Float[Tensor, "S 3"]
     colors: Float[Tensor, "S 3"]
     camera: Camera
     depth: Float[Tensor, "h w"]
     step: int
+    votes: int
 
 
 def depth_points(
@@ -57,20 +64,36 @@ def depth_points(
         return nothing
     generator = torch.Generator().manual_seed(seed)
     views = _evenly(scene.train_views)
-    photos = [seen for view in views if (seen := _look(view, scene.points, config, generator))]
-    if not photos:
-        return nothing
-    points, colors = torch.cat([seen.points for seen in photos]), torch.cat([seen.colors for seen in photos])
-    sources = torch.cat([torch.full((len(seen.points),), index) for index, seen in enumerate(photos)])
-    means, means_of_color, support = _by_cell(points, colors, sources, config.cell)
-    kept = (support >= config.support) & ~_near(means, scene.points, config.cell)
-    means, means_of_color, support = means[kept], means_of_color[kept], support[kept]
-    kept = support >= config.agreement * (support + _seen_through(means, photos, config.cell))
-    means, means_of_color = means[kept], means_of_color[kept]
+    photos = [seen for view in views for seen in _look(view, scene.points, config, generator)]
+    known, parts = scene.points, [nothing]
+    for votes, cell in ((METRIC_VOTES, METRIC_CELL * config.cell), (1, config.cell)):
+        asked = [seen for seen in photos if seen.votes == votes]
+        if asked:
+            parts.append(_agreed(asked, photos, known, cell, config))
+            known = torch.cat([known, parts[-1][0]])
+    means, colors = (torch.cat(both) for both in zip(*parts, strict=True))
     if len(means) > config.points:
         chosen = torch.randperm(len(means), generator=generator)[: config.points].sort().values
-        means, means_of_color = means[chosen], means_of_color[chosen]
-    return means, means_of_color.round().clamp(0, 255).to(torch.uint8)
+        means, colors = means[chosen], colors[chosen]
+    return means, colors
+
+
+def _agreed(
+    asked: Sequence[_Seen],
+    photos: Sequence[_Seen],
+    known: Float[Tensor, "K 3"],
+    cell: float,
+    config: DepthPointsConfig,
+) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"]]:
+    """A point for each cell of what some photos see, where enough photos agree and no point is known."""
+    points, colors = torch.cat([seen.points for seen in asked]), torch.cat([seen.colors for seen in asked])
+    sources = torch.cat([torch.full((len(seen.points),), index) for index, seen in enumerate(asked)])
+    votes = torch.tensor([seen.votes for seen in asked])
+    means, means_of_color, support = _by_cell(points, colors, sources, votes, cell)
+    kept = (support >= config.support) & ~_near(means, known, cell)
+    means, means_of_color, support = means[kept], means_of_color[kept], support[kept]
+    kept = support >= config.agreement * (support + _seen_through(means, photos, config.cell))
+    return means[kept], means_of_color[kept].round().clamp(0, 255).to(torch.uint8)
 
 
 def _evenly(views: Sequence[View]) -> list[View]:
@@ -92,29 +115,51 @@ def _looked_up(
 
 def _look(
     view: View, points: Float[Tensor, "P 3"], config: DepthPointsConfig, generator: torch.Generator
-) -> _Seen | None:
-    """What a photo says in the scene's scale; None where it has no disparity that fits the points."""
-    disparity = view.read_disparity()
+) -> Iterator[_Seen]:
+    """What a photo says in the scene's scale: by metric depth, and by its disparity where that knows nothing."""
+    metric, disparity = view.read_depth(), view.read_disparity()
+    if metric is not None:
+        yield _sampled(view, metric, METRIC_VOTES, config)
     if disparity is None:
-        return None
-    z, sampled = _looked_up(points, view.camera, disparity)
-    known = sampled > 0
-    fit = fit_disparity(sampled[known], 1 / z[known], generator)
+        return
+    fitted = _scaled(view.camera, disparity, metric, points, generator)
+    if fitted is not None:
+        yield _sampled(view, fitted if metric is None else torch.where(metric > 0, 0.0, fitted), 1, config)
+
+
+def _scaled(
+    camera: Camera,
+    disparity: Float[Tensor, "H W"],
+    metric: Float[Tensor, "H W"] | None,
+    points: Float[Tensor, "P 3"],
+    generator: torch.Generator,
+) -> Float[Tensor, "H W"] | None:
+    """A disparity as depth, by the points and the metric depth of its photo; None where it fits neither."""
+    z, sampled = _looked_up(points, camera, disparity)
+    z, sampled = z[sampled > 0], sampled[sampled > 0]
+    if metric is not None:
+        both = (metric > 0) & (disparity > 0)
+        z, sampled = torch.cat([z, metric[both]]), torch.cat([sampled, disparity[both]])
+    fit = fit_disparity(sampled, 1 / z, generator)
     if fit is None:
         return None
     inverse = fit[0] * disparity + fit[1]
     # Beyond the farthest points that were fitted, a small error of the disparity is a large one of depth.
-    reliable = (disparity > 0) & (inverse * z[known].sort().values[int(0.98 * (int(known.sum()) - 1))] > 1)
-    depth = torch.where(reliable, 1 / inverse.clamp_min(1e-6), 0.0)
+    reliable = (disparity > 0) & (inverse * z.sort().values[int(0.98 * (len(z) - 1))] > 1)
+    return torch.where(reliable, 1 / inverse.clamp_min(1e-6), 0.0)
+
+
+def _sampled(view: View, depth: Float[Tensor, "H W"], votes: int, config: DepthPointsConfig) -> _Seen:
     # Two to a cell's side at the usual depth.
-    step = max(1, int(0.5 * config.cell * float(view.camera.K[0, 0])))
+    cell = METRIC_CELL * config.cell if votes == METRIC_VOTES else config.cell
+    step = max(1, int(0.5 * cell * float(view.camera.K[0, 0])))
     keep = (depth > 0) & (depth < config.farthest)
     mask = view.read_mask()
     if mask is not None:
         keep = keep & (mask > 0)
     keep, places = keep[::step, ::step], view.camera.unproject(depth)[::step, ::step]
     colors = view.read_photo()[::step, ::step][keep].float()
-    return _Seen(places[keep], colors, view.camera, depth[::step, ::step].contiguous(), step)
+    return _Seen(places[keep], colors, view.camera, depth[::step, ::step].contiguous(), step, votes)
 
 
 def fit_disparity(
@@ -164,15 +209,19 @@ def _cells(points: Float[Tensor, "P 3"], cell: float) -> Int[Tensor, " P"]:
 
 
 def _by_cell(
-    points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"], photos: Int[Tensor, " P"], cell: float
+    points: Float[Tensor, "P 3"],
+    colors: Float[Tensor, "P 3"],
+    photos: Int[Tensor, " P"],
+    votes: Int[Tensor, " S"],
+    cell: float,
 ) -> tuple[Float[Tensor, "C 3"], Float[Tensor, "C 3"], Int[Tensor, " C"]]:
-    """Mean place and colour of each cell's points, and how many photos they are from."""
+    """Mean place and colour of each cell's points, and the votes of the photos they are from."""
     keys, member = torch.unique(_cells(points, cell), return_inverse=True)
     number = torch.zeros(len(keys)).index_add_(0, member, torch.ones(len(points)))[:, None]
     places = torch.zeros(len(keys), 3).index_add_(0, member, points) / number
     means = torch.zeros(len(keys), 3).index_add_(0, member, colors) / number
     pairs = torch.unique(torch.stack([member, photos]), dim=1)
-    return places, means, torch.bincount(pairs[0], minlength=len(keys))
+    return places, means, torch.zeros(len(keys), dtype=torch.int64).index_add_(0, pairs[0], votes[pairs[1]])
 
 
 def _near(points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"], cell: float) -> Bool[Tensor, " P"]:

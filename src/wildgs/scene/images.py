@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped, UInt8, UInt16
+from jaxtyping import Float32, Shaped, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
 
 from wildgs.files import check_regular
@@ -58,16 +58,19 @@ class Photo:
         mask: 0 = ignore (transparent, outside the lens's picture, or the user's own mask), 255 = use; None where
             nothing is ignored.
         disparity: Depth prior, 16 bits, large = near, 0 = no estimate; None where there is none.
+        depth: Metric depth along the camera's axis in the scene's units, 0 = no estimate; None where there is none.
     """
 
     pixels: UInt8[np.ndarray, "H W 3"]
     mask: UInt8[np.ndarray, "H W"] | None = None
     disparity: UInt16[np.ndarray, "H W"] | None = None
+    depth: Float32[np.ndarray, "H W"] | None = None
 
     @property
     def num_bytes(self) -> int:
         """Memory of its arrays."""
-        return sum(array.nbytes for array in (self.pixels, self.mask, self.disparity) if array is not None)
+        arrays = (self.pixels, self.mask, self.disparity, self.depth)
+        return sum(array.nbytes for array in arrays if array is not None)
 
 
 class _DecodingBudget:
@@ -266,6 +269,25 @@ def read_disparity(
         total = np.asarray(Image.fromarray(values * valid).resize(size, Image.Resampling.BOX))
         values = np.where(share >= 0.5, np.maximum(total / np.maximum(share, 0.5), 1.0), 0.0)
     return np.clip(np.round(values), 0, 65535).astype(np.uint16)
+
+
+def read_depth(
+    path: Path, size: tuple[int, int], max_pixels: int = MAX_IMAGE_PIXELS
+) -> Float32[np.ndarray, "H W"]:
+    """Decode a metric depth map (32-bit floats, 0 = no estimate).
+
+    A smaller pixel takes the nearest one's value: a mean over an edge would lie where there is nothing.
+
+    Raises:
+        UnreadableImageError: The file cannot be decoded, holds other numbers, or has another shape than `size`.
+    """
+    with open_image(path, max_pixels) as image, decoding(image):
+        _check_shape(image, size)
+        _load(image)
+        if image.mode != "F":
+            raise UnreadableImageError("metric depth has 32-bit floats, one channel")
+        values = np.asarray(image.resize(size, Image.Resampling.NEAREST), dtype=np.float32)
+    return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
 
 
 def _check_shape(image: Image.Image, size: tuple[int, int]) -> None:

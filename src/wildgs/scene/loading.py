@@ -75,6 +75,7 @@ def load_scene(
         use_masks=config.use_masks,
         use_depth=config.use_depth,
         max_pixels=config.max_image_pixels,
+        depth_scale=alignment.scale,
     )
     chosen = [image for image in model.images if image.name in splits]
     views, broken = _load_views(chosen, splits, photos, alignment, config, lazy, progress)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import fingerprint, is_there
@@ -19,11 +20,21 @@ from wildgs.scene.images import (
     Photo,
     ShapeMismatchError,
     UnreadableImageError,
+    read_depth,
     read_disparity,
     read_mask,
     read_photo,
 )
-from wildgs.scene.undistort import PixelGrid, inside, sample_colors, sample_disparity, sample_mask
+from wildgs.scene.undistort import (
+    PixelGrid,
+    inside,
+    sample_colors,
+    sample_depth,
+    sample_disparity,
+    sample_mask,
+)
+
+_Values = TypeVar("_Values", bound=np.ndarray)
 
 
 def with_ending(name: str, ending: str) -> str:
@@ -44,6 +55,11 @@ def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
         for name in names
     }
     return {name: root / "depth" / file for name, file in files.items()}
+
+
+def metric_file(disparity: Path) -> Path:
+    """The file of a photo's metric depth, beside that of its disparity: 32-bit floats, units of the model."""
+    return disparity.with_suffix(".tiff")
 
 
 def _shared_stems(names: Iterable[str]) -> set[str]:
@@ -110,8 +126,21 @@ class ScenePhotos(PhotoStore):
         use_masks: bool = True,
         use_depth: bool = True,
         max_pixels: int = MAX_IMAGE_PIXELS,
+        depth_scale: float = 1.0,
     ) -> None:
-        """Starts without photos, which `add` registers; `names` are all photos of the model."""
+        """Starts without photos, which `add` registers.
+
+        Args:
+            root: The scene's folder.
+            images_dir: That of its photos.
+            names: All photos of the model.
+            cache: Keeps decoded photos.
+            use_masks: Whether masks/ is read.
+            use_depth: Whether depth/ is read.
+            max_pixels: Larger pictures are not read.
+            depth_scale: The scene's units in one of the model's.
+        """
+        self.depth_scale = depth_scale
         self.root = root
         self.images_dir = images_dir
         self.cache = cache
@@ -121,7 +150,7 @@ class ScenePhotos(PhotoStore):
         self._grids: dict[str, PixelGrid] = {}
         self._depth = depth_files(root, names)
         self._shared = _shared_stems(names)
-        self._without_depth: set[str] = set()
+        self._without_depth: set[Path] = set()
         self.blank: set[str] = set()
 
     def add(self, name: str, grid: PixelGrid) -> None:
@@ -155,6 +184,7 @@ class ScenePhotos(PhotoStore):
             "content": self.images_dir / name,
             "mask": self.find_mask(name) if self.use_masks else None,
             "depth prior": self._depth[name] if self.use_depth else None,
+            "metric depth": metric_file(self._depth[name]) if self.use_depth else None,
         }
         return {what: digest for what, file in files.items() if file and (digest := fingerprint(file))}
 
@@ -198,7 +228,8 @@ class ScenePhotos(PhotoStore):
         names = {path.relative_to(self.images_dir).as_posix() for path in self.images_dir.rglob("*")}
         known = {path.relative_to(self.root / "depth").as_posix() for path in self._depth.values()}
         for name in names | set(self._depth):
-            known |= {name, f"{name}.png", with_ending(name, ".png")}
+            known |= {name, *(f"{name}{end}" for end in (".png", ".tiff"))}
+            known |= {with_ending(name, end) for end in (".png", ".tiff")}
         return sorted(
             name
             for path in files
@@ -239,23 +270,36 @@ class ScenePhotos(PhotoStore):
         if mask_path is not None:
             masks.append(self._read_mask(mask_path, grid))
         mask = np.minimum.reduce(masks) if masks else None
-        return Photo(pixels, None if mask is None or mask.all() else mask, self._read_disparity(name, grid))
+        mask = None if mask is None or mask.all() else mask
+        return Photo(pixels, mask, self._read_disparity(name, grid), self._read_depth(name, grid))
 
     def _read_disparity(self, name: str, grid: PixelGrid) -> UInt16[np.ndarray, "H W"] | None:
-        """The depth prior; a missing or broken file is looked for, and warned of, once."""
-        path = self._depth[name]
-        if not self.use_depth or name in self._without_depth or not is_there(path):
-            self._without_depth.add(name)
+        disparity = self._read_prior(self._depth[name], grid, read_disparity)
+        source = None if disparity is None else grid.source()
+        return disparity if source is None or disparity is None else sample_disparity(disparity, source)
+
+    def _read_depth(self, name: str, grid: PixelGrid) -> Float32[np.ndarray, "H W"] | None:
+        depth = self._read_prior(metric_file(self._depth[name]), grid, read_depth)
+        if depth is None:
+            return None
+        source = grid.source()
+        depth = depth if source is None else sample_depth(depth, source)
+        return depth * np.float32(self.depth_scale)
+
+    def _read_prior(
+        self, path: Path, grid: PixelGrid, read: Callable[[Path, tuple[int, int], int], _Values]
+    ) -> _Values | None:
+        """A file of depth/; one that is missing or broken is looked for, and warned of, once."""
+        if not self.use_depth or path in self._without_depth or not is_there(path):
+            self._without_depth.add(path)
             return None
         try:
-            disparity = read_disparity(path, grid.resized, self.max_pixels)
+            return read(path, grid.resized, self.max_pixels)
         except UnreadableImageError as error:
-            self._without_depth.add(name)
+            self._without_depth.add(path)
             warnings.warn(
                 f"{path}: {error}; this photo trains without depth (delete the file and run `wildgs depth`)",
                 WildGSWarning,
                 stacklevel=2,
             )
             return None
-        source = grid.source()
-        return disparity if source is None else sample_disparity(disparity, source)

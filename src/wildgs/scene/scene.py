@@ -115,6 +115,11 @@ class View:
         disparity = self.photos.get(self.name).disparity
         return None if disparity is None else torch.from_numpy(disparity.astype(np.float32) / 65535.0)
 
+    def read_depth(self) -> Float[Tensor, "H W"] | None:
+        """Metric depth along the camera's axis in the scene's units; 0 = no estimate; None where there is none."""
+        depth = self.photos.get(self.name).depth
+        return None if depth is None else torch.from_numpy(depth)
+
     def read_clean(self) -> UInt8[Tensor, "H W 3"] | None:
         """The photo without its transients, which only evaluation may look at; None where there is none."""
         clean = self.photos.read_clean(self.name)

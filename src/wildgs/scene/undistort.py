@@ -67,11 +67,22 @@ class PixelGrid:
         """For every pixel of the view, where (row, column as array indices) it lies in the resized photo."""
         if self.distorted is None or self.undistorted is None:
             return None
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        rays = self.undistorted.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
-        rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-        pixels = self.distorted.img_from_cam(rays).reshape(self.height, self.width, 2)
-        return np.nan_to_num(pixels[..., ::-1] - 0.5, nan=-1e6).astype(np.float32)
+        return _places(self.undistorted, self.distorted, self.width, self.height)
+
+    def target(self) -> Float32[np.ndarray, "h w 2"] | None:
+        """For every pixel of the resized photo, where (row, column as array indices) it lies in the view."""
+        if self.distorted is None or self.undistorted is None:
+            return None
+        return _places(self.distorted, self.undistorted, *self.resized)
+
+
+def _places(camera: Any, other: Any, width: int, height: int) -> Float32[np.ndarray, "H W 2"]:
+    """Where (row, column) pixels of one camera of a lens lie in a picture of the other."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = camera.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
+    rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    pixels = other.img_from_cam(rays).reshape(height, width, 2)
+    return np.nan_to_num(pixels[..., ::-1] - 0.5, nan=-1e6).astype(np.float32)
 
 
 def _intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
@@ -106,6 +117,14 @@ def sample_disparity(
     share = _sample((disparity > 0).astype(np.float32), source, order=1)
     mean = np.maximum(values / np.maximum(share, 0.5), 1.0)
     return np.where(share >= 0.5, np.clip(np.round(mean), 0, 65535), 0).astype(np.uint16)
+
+
+def sample_depth(
+    depth: Float32[np.ndarray, "h w"], source: Float32[np.ndarray, "H W 2"]
+) -> Float32[np.ndarray, "H W"]:
+    """Depth of the view: the nearest pixel's, 0 outside the picture."""
+    values = _sample(depth, source, order=0)
+    return np.where(inside(source, (depth.shape[1], depth.shape[0])), values, np.float32(0))
 
 
 def _sample(

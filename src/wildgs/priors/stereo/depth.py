@@ -1,0 +1,162 @@
+"""Depth of a scene's photos where several of them agree, and the files that keep it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from PIL import Image
+from torch import Tensor
+
+from wildgs.files import written_aside
+from wildgs.priors.config import GroundConfig, StereoConfig
+from wildgs.priors.ground import find_ground
+from wildgs.priors.stereo.agreement_kernels import count_agreeing, drop_specks
+from wildgs.priors.stereo.neighbours import choose_neighbours, seen_rows
+from wildgs.priors.stereo.photos import Level, Planes
+from wildgs.priors.stereo.search import Search
+from wildgs.scene import Scene, load_scene
+from wildgs.scene.colmap import read_model
+from wildgs.scene.config import DataConfig
+from wildgs.scene.photo_store import depth_files, metric_file
+from wildgs.scene.undistort import PixelGrid, sample_depth
+from wildgs.threads import launch
+
+
+def stereo_depth(
+    scene: Scene, config: StereoConfig, progress: Callable[[int, int], None] | None = None
+) -> dict[str, Float32[np.ndarray, "H W"]]:
+    """Depth of the training photos; photos that test are not looked at.
+
+    Args:
+        scene: With photos at the size at which they are compared.
+        config: How many neighbours, and what counts as agreement.
+        progress: Called with (photos done, photos in all).
+
+    Returns:
+        By photo, depth along the camera's axis in the scene's frame, at the view's size; 0 where photos do not
+        agree.
+    """
+    views = scene.train_views
+    neighbours = choose_neighbours(scene, config.neighbours)
+    fine = Level.of_views(views)
+    coarse = fine.halved()
+    ground = _ground(scene)
+    found, refined = coarse.no_planes(), fine.no_planes()
+    searches = [
+        Search.of(
+            view,
+            photo,
+            others,
+            scene.points[torch.from_numpy(seen_rows(scene, view))],
+            ground,
+            coarse.cameras[photo],
+            config.seed,
+        )
+        for photo, (view, others) in enumerate(zip(views, neighbours, strict=True))
+    ]
+    for photo, search in enumerate(searches):
+        if search is not None:
+            search.begin(coarse, found)
+        if progress is not None:
+            progress(photo, 2 * len(views))
+    for photo, search in enumerate(searches):
+        if search is not None:
+            search.refine(coarse, found, fine, refined)
+        if progress is not None:
+            progress(len(views) + photo + 1, 2 * len(views))
+    return {
+        view.name: agreed_depth(fine, photo, others, refined, config)
+        for photo, (view, others) in enumerate(zip(views, neighbours, strict=True))
+    }
+
+
+def _ground(scene: Scene) -> Float[Tensor, "3"] | None:
+    centers = torch.stack([view.camera.position for view in scene.train_views])
+    return find_ground(scene.points, centers, GroundConfig().tolerance, torch.Generator().manual_seed(0))
+
+
+def agreed_depth(
+    level: Level,
+    photo: int,
+    others: list[int],
+    found: Planes,
+    config: StereoConfig,
+) -> Float32[np.ndarray, "H W"]:
+    """Depth of a photo where enough neighbours agree."""
+    _, width, height = level.layout[photo]
+    if not others:
+        return np.zeros((height, width), np.float32)
+    inverse, agreeing = np.empty((height, width), np.float32), np.empty((height, width), np.int32)
+    launch(
+        count_agreeing,
+        photo,
+        level.layout,
+        np.array(others),
+        level.motions(photo, others),
+        level.returns(photo, others),
+        found.planes,
+        found.costs,
+        np.float32(config.max_cost),
+        np.float32(config.tolerance),
+        np.float32(config.reach),
+        inverse,
+        agreeing,
+        items=int(height),
+    )
+    kept = np.empty((height, width), np.bool_)
+    specks = (found.of(photo)[0], agreeing >= config.agreeing, np.float32(config.tolerance), config.support)
+    launch(drop_specks, *specks, kept, items=int(height))
+    return np.where(kept, 1 / np.where(kept, inverse, 1), 0).astype(np.float32)
+
+
+def fill_metric_folder(
+    root: Path,
+    config: StereoConfig,
+    *,
+    holdout: int = DataConfig().holdout,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[int, int]:
+    """Write the metric depth of the training photos of a scene, in units of its model (see `metric_file`).
+
+    Photos that are held out are not looked at: what trains on the result knows nothing of them.
+
+    Args:
+        root: The scene's folder.
+        config: Of the search.
+        holdout: Which photos are held out where the scene has no split file, see `DataConfig`.
+        overwrite: Estimate again what is already there.
+        progress: Called with (photos done, photos in all).
+
+    Returns:
+        How many were written, and how many were there before.
+
+    Raises:
+        UserError: There is no scene.
+    """
+    data = DataConfig(max_side=config.max_side, holdout=holdout, use_depth=False)
+    scene = load_scene(root, data)
+    model = read_model(root)
+    targets = {
+        name: metric_file(path) for name, path in depth_files(root, [i.name for i in model.images]).items()
+    }
+    wanted = [view.name for view in scene.train_views if overwrite or not targets[view.name].is_file()]
+    kept = len(scene.train_views) - len(wanted)
+    if not wanted:
+        return 0, kept
+    depths = stereo_depth(scene, config, progress)
+    cameras = {image.name: image.camera for image in model.images}
+    for name in wanted:
+        depth = depths[name] / np.float32(scene.alignment.scale)
+        place = PixelGrid.from_colmap(cameras[name], data.downscale, data.max_side).target()
+        _write_tiff(depth if place is None else sample_depth(depth, place), targets[name])
+    return len(wanted), kept
+
+
+def _write_tiff(depth: Float32[np.ndarray, "H W"], target: Path) -> None:
+    with written_aside(target) as aside:
+        Image.fromarray(depth).save(aside, "TIFF", compression="tiff_deflate")
