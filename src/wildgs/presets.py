@@ -46,6 +46,7 @@ _PAPER: dict[str, Any] = {
     "train.objective.depth_weight": 0.05,
     "train.objective.metric_weight": 0.0,
     "train.schedule.encoder_every": 1,
+    "train.schedule.reset_every": 3000,
     "train.schedule.mask_every": 1,
     "train.schedule.planes_every": 1,
     "train.optimizer.short_runs": 0.0,

@@ -6,6 +6,8 @@ import pytest
 
 from wildgs.engine.schedule import Schedule, ScheduleConfig, exponential
 from wildgs.errors import UserError
+from wildgs.model.vanilla import VanillaGS
+from wildgs.model.wildgs import WildGS
 
 
 def test_paper_length_keeps_the_papers_steps() -> None:
@@ -105,3 +107,10 @@ def test_mask_and_planes_take_turns() -> None:
     both = Schedule(ScheduleConfig(mask_every=1, planes_every=1, reset_every=0), 30_000).stage(3, 3)
     assert both.learn_mask
     assert both.learn_planes
+
+
+def test_resets_are_the_methods_unless_they_are_given() -> None:
+    """Wild-GS has none: what it renders then differs from every photo, and masks and colour match with it."""
+    assert Schedule(ScheduleConfig(), 30_000, WildGS.reset_every).reset_every == 0
+    assert Schedule(ScheduleConfig(), 30_000, VanillaGS.reset_every).reset_every == 3000
+    assert Schedule(ScheduleConfig(reset_every=6000), 30_000, WildGS.reset_every).reset_every == 6000

@@ -19,7 +19,7 @@ class ScheduleConfig:
         densify_from: First densification (3DGS: 500).
         densify_until: Last densification and reset (3DGS: 15,000).
         densify_every: Between densifications (3DGS: 100); 0 = no densification, pruning and opacity resets.
-        reset_every: Between opacity resets (3DGS: 3,000); 0 = no resets.
+        reset_every: Between opacity resets; 0 = no resets. By default the method's: 3,000 for 3DGS, none for Wild-GS.
         mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
@@ -32,7 +32,7 @@ class ScheduleConfig:
     densify_from: int = 500
     densify_until: int = 15_000
     densify_every: int = 100
-    reset_every: int = 3000
+    reset_every: int | None = None
     mask_pause: int = 500
     sh_every: int = 1000
     encoder_every: int = 2
@@ -43,7 +43,7 @@ class ScheduleConfig:
         """Refuses negative steps, and 0 where it means nothing."""
         for name, value in vars(self).items():
             least = 1 if name in ("sh_every", "encoder_every", "mask_every", "planes_every") else 0
-            if value < least:
+            if value is not None and value < least:
                 raise UserError(f"schedule.{name} {value}: must be {least} or more")
 
 

@@ -25,8 +25,14 @@ _FLOOR_SHARE = 5
 class Schedule:
     """The schedules of one run."""
 
-    def __init__(self, config: ScheduleConfig, steps: int) -> None:
-        """Scales a configuration in the paper's steps to a run of `steps`."""
+    def __init__(self, config: ScheduleConfig, steps: int, reset_every: int = 3000) -> None:
+        """Scales a configuration in the paper's steps to a run.
+
+        Args:
+            config: In the paper's steps.
+            steps: Length of the run.
+            reset_every: The method's, where the configuration names none.
+        """
         self.steps = steps
         self.encoder_every = config.encoder_every
         self.mask_every = config.mask_every
@@ -38,8 +44,8 @@ class Schedule:
         self.densify_every = (
             self._scaled(config.densify_every, "densify_every") if config.densify_every else 0
         )
-        resets = config.densify_every and config.reset_every
-        self.reset_every = self._scaled(config.reset_every, "reset_every") if resets else 0
+        resets = reset_every if config.reset_every is None else config.reset_every
+        self.reset_every = self._scaled(resets, "reset_every") if resets and config.densify_every else 0
         self.mask_pause = self._scaled(config.mask_pause, "mask_pause")
         self.sh_every = self._scaled(config.sh_every, "sh_every")
 

@@ -117,7 +117,7 @@ class Trainer:
         self.device = method.gaussians.means.device
         self.step = 0
         self.seconds = 0.0
-        self.schedule = Schedule(config.schedule, config.steps)
+        self.schedule = Schedule(config.schedule, config.steps, method.reset_every)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size, config.steps)

@@ -33,6 +33,7 @@ class Method(nn.Module, ABC):
         relightable: Whether photos have a say in the colours; if not, there is one light only.
         gaussians: The Gaussians.
         config: An instance of `Config`.
+        reset_every: Steps between opacity resets in a run of 30,000, where the schedule names none; 0 for none.
         sh_degree: Degree of the spherical harmonics that `shade` gives.
         global_size: Length of the global embedding; 0 for a method that is not relightable.
         local_size: Length of the local embeddings; 0 for a method that has none.
@@ -44,6 +45,7 @@ class Method(nn.Module, ABC):
     label: ClassVar[str]
     Config: ClassVar[type]
     memory: ClassVar[MemoryUse]
+    reset_every: ClassVar[int] = 3000
     relightable: ClassVar[bool] = True
 
     gaussians: Gaussians

@@ -35,6 +35,7 @@ class WildGS(Method):
     label: ClassVar[str] = "Wild-GS"
     Config: ClassVar[type] = WildGSConfig
     memory: ClassVar[MemoryUse] = MemoryUse(per_gaussian=6000, per_pixel=700, fixed=600 * 2**20)
+    reset_every: ClassVar[int] = 0
     config: WildGSConfig
 
     def __init__(
