@@ -19,7 +19,8 @@ class ScheduleConfig:
         densify_from: First densification (3DGS: 500).
         densify_until: Last densification and reset (3DGS: 15,000).
         densify_every: Between densifications (3DGS: 100); 0 = no densification, pruning and opacity resets.
-        reset_every: Between opacity resets; 0 = no resets. By default the method's: 3,000 for 3DGS, none for Wild-GS.
+        reset_every: Between opacity resets; 0 = no resets. By default the method's: 3,000 for 3DGS, none for
+            Wild-GS.
         mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
