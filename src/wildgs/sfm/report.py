@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from wildgs.files import printable
+from wildgs.scene.colmap import describe_names
 from wildgs.sfm.pairs import PairingName
+from wildgs.sfm.placement import Placement
 
 REPORT_NAME = "sfm_report.json"
 
@@ -29,6 +31,9 @@ class SfmReport:
         pairs: How many pairs were matched.
         models: Sizes of all models found, largest first; the first is kept.
         seconds: Time taken.
+        placed: How sure each pose is, by name in the scene.
+        copies: From copies and crops of a photo to the photo.
+        doubtful: From the names of photos with a pose to what contradicts it.
     """
 
     photos: int
@@ -42,6 +47,9 @@ class SfmReport:
     seconds: float
     renamed: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[str, ...] = ()
+    placed: Mapping[str, Placement] = field(default_factory=dict)
+    copies: Mapping[str, str] = field(default_factory=dict)
+    doubtful: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """The report in plain sentences."""
@@ -50,6 +58,16 @@ class SfmReport:
             f" {self.reprojection_error:.2f} px mean reprojection error"
             f" ({self.pairs} pairs, {self.pairing}, {self.seconds:.0f} s)"
         ]
+        later = [name for name, how in self.placed.items() if how.placed_by != "first"]
+        if later:
+            text.append(f"{len(later)} of them at the second chance: {_some(later)}")
+        if self.copies:
+            text.append(
+                f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"
+            )
+        if self.doubtful:
+            text.append(f"{len(self.doubtful)} poses are doubtful (look-alikes, or wrong):")
+            text += [f"  {printable(name)}: {why}" for name, why in sorted(self.doubtful.items())]
         if self.left_out:
             text.append(
                 f"{len(self.left_out)} photos have no pose and take no part; the others are not affected:"
@@ -65,6 +83,10 @@ class SfmReport:
         text = json.dumps(asdict(self), indent=2, ensure_ascii=False)
         # Bytes that are not UTF-8 become JSON's own escapes, from which `read` gets them back.
         (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def _some(names: Sequence[str]) -> str:
+    return describe_names([printable(name) for name in names])
 
 
 def read_masks(folder: Path) -> list[str]:
