@@ -24,6 +24,7 @@ from wildgs.sfm.mapping import (
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
 from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, friends_of_friends
 from wildgs.sfm.placement import Findings, PassName
+from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -32,6 +33,9 @@ SECOND_NEIGHBOURS = 1
 
 ENOUGH_MATCHES = 60
 """Pairs with so many are not matched again."""
+
+THIRD_ROUNDS = 3
+"""Photos that were placed by matches to points bring points for others."""
 
 LEAST_POINTS = 10
 """Sparse points of a photo that a second chance placed."""
@@ -79,7 +83,7 @@ def find_poses(
             match_pairs(work, copies, more, config, show, tolerant=True)
             work.set_done("second matches")
         pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
-        models = _try_again(work, copies, models, passes, config, progress)
+        models = _try_again(work, copies, vlads, models, passes, config, progress)
     if not models:
         return None
     return Poses(models, pairing, passes, Findings(crops, drop_impossible(models[0])))
@@ -112,16 +116,27 @@ def _second_pairs(
 def _try_again(
     work: Workplace,
     copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
     models: list[Any],
     passes: dict[str, PassName],
     config: SfmConfig,
     progress: Progress,
 ) -> list[Any]:
-    """Models after the second chance; notes in `passes` which photos it placed."""
+    """Models after the second and third chance; notes in `passes` which photos they placed."""
     if not models:
         return map_photos(work, len(copies), config, progress)
     main = continue_mapping(work, models[0], len(copies), config, progress)
     _note_new(models[0], main, passes, "second")
+    for _ in range(THIRD_ROUNDS):
+        show = counter(progress, "matching to points")
+        if not missing_from(main, copies) or not match_to_points(
+            work, copies, vlads, main, config.seed, show
+        ):
+            break
+        before, main = main, continue_mapping(work, main, len(copies), config, progress)
+        _note_new(before, main, passes, "third")
+        if main.num_reg_images() == before.num_reg_images():
+            break
     drop_unsure(main, work, passes)
     rest = [copies[photo].work_name for photo in missing_from(main, copies)]
     groups = map_photos(work, len(copies), config, progress, only=rest) if len(rest) >= LEAST_GROUP else []

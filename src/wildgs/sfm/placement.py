@@ -16,7 +16,7 @@ from wildgs.sfm.matching import image_ids, verified_pairs
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
-PassName = Literal["first", "second"]
+PassName = Literal["first", "second", "third"]
 
 NEIGHBOUR_POINTS = 15
 """Points that a neighbour shares with a photo, at least."""
@@ -27,7 +27,8 @@ class Placement:
     """How sure the pose of a photo is.
 
     Attributes:
-        placed_by: The first pass, or the second chance, with more partners and fewer inliers.
+        placed_by: The first pass; the second, with more partners and fewer inliers; or the third, with matches to
+            points.
         points: Sparse points that the photo observes.
         reprojection_error: Their mean error, pixels.
         neighbours: Photos that share 15 points or more with it.

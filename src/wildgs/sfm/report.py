@@ -60,7 +60,7 @@ class SfmReport:
         ]
         later = [name for name, how in self.placed.items() if how.placed_by != "first"]
         if later:
-            text.append(f"{len(later)} of them at the second chance: {_some(later)}")
+            text.append(f"{len(later)} of them at a second or third chance: {_some(later)}")
         if self.copies:
             text.append(
                 f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"
