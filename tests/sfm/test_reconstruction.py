@@ -17,6 +17,7 @@ from wildgs.scene.colmap import read_model
 from wildgs.sfm import matching, reconstruction
 from wildgs.sfm.config import PairingConfig, SfmConfig
 from wildgs.sfm.reconstruction import reconstruct
+from wildgs.sfm.report import describe_placed, read_left_out
 from wildgs.sfm.workplace import Workplace
 
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
@@ -93,6 +94,10 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     assert all(how.placed_by == "first" and how.neighbours >= 2 for how in report.placed.values())
     assert all(0 < how.reprojection_error < 1 for how in report.placed.values())
     assert report.doubtful == {}
+    assert report.pictures == {}  # a blank photo matches none
+    left_out = {photo.name: photo for photo in read_left_out(tmp_path / "scene")}
+    assert left_out["blank.jpg"].picture is None
+    assert "7 photos have a pose, 0 of them by a second" in describe_placed(tmp_path / "scene")
     assert ("reading photos", 9, 9) in steps
     assert steps[-1][0] == "undistorting"
     assert any("blank.jpg" in line for line in report.lines())

@@ -22,13 +22,15 @@ from wildgs.scene.undistort import PixelGrid, sample_mask
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import find_registered, quiet
+from wildgs.sfm.match_pictures import FOLDER as PICTURES
+from wildgs.sfm.match_pictures import write_match_pictures
 from wildgs.sfm.passes import find_poses
 from wildgs.sfm.placement import failures, placements
 from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
 from wildgs.sfm.workplace import Workplace, open_workplace
 
-SCENE_PARTS = ("images", "sparse", "masks", REPORT_NAME)
+SCENE_PARTS = ("images", "sparse", "masks", PICTURES, REPORT_NAME)
 ASIDE, MOVED, DONE = ".replaced", ".moved", ".done"
 """Folder of the old scene while the new one takes its place, and the files in it that say that the old scene is
 complete there, and that the new one is in its place."""
@@ -112,6 +114,7 @@ def _reconstruct(
             masks=_files_in(work.scene / "masks"),
             placed=placements(model, copies, poses.passes),
             copies={copies[a].name: copies[b].name for a, b in poses.findings.crops.items()},
+            pictures=write_match_pictures(work, copies, without),
             doubtful={names[n]: why for n, why in find_doubtful(model, work.database, names).items()},
         )
         report.write(work.scene)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from wildgs.files import printable
 from wildgs.scene.colmap import describe_names
@@ -34,6 +35,7 @@ class SfmReport:
         placed: How sure each pose is, by name in the scene.
         copies: From copies and crops of a photo to the photo.
         doubtful: From the names of photos with a pose to what contradicts it.
+        pictures: From the names of photos without a pose to pictures of their best matches, files of the scene.
     """
 
     photos: int
@@ -50,6 +52,7 @@ class SfmReport:
     placed: Mapping[str, Placement] = field(default_factory=dict)
     copies: Mapping[str, str] = field(default_factory=dict)
     doubtful: Mapping[str, str] = field(default_factory=dict)
+    pictures: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """The report in plain sentences."""
@@ -91,8 +94,50 @@ def _some(names: Sequence[str]) -> str:
 
 def read_masks(folder: Path) -> list[str]:
     """The masks that an earlier report lists; none if there is no report, or an older one without the list."""
-    try:
-        masks = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8")).get("masks", [])
-    except (OSError, ValueError, AttributeError):
-        return []
+    masks = _read(folder).get("masks", [])
     return [str(name) for name in masks] if isinstance(masks, list) else []
+
+
+@dataclass(frozen=True)
+class LeftOutPhoto:
+    """A photo without a pose, the reason, and the picture of its best matches, where there is one."""
+
+    name: str
+    reason: str
+    picture: Path | None
+
+
+def read_left_out(folder: Path) -> list[LeftOutPhoto]:
+    """The photos without a pose that the report of a scene lists, with their pictures."""
+    record = _read(folder)
+    reasons, pictures = record.get("left_out", {}), record.get("pictures", {})
+    if not isinstance(reasons, dict) or not isinstance(pictures, dict):
+        return []
+    files = {name: folder / str(picture) for name, picture in pictures.items()}
+    return [
+        LeftOutPhoto(name, str(reason), files[name] if name in files and files[name].is_file() else None)
+        for name, reason in sorted(reasons.items())
+    ]
+
+
+def describe_placed(folder: Path) -> str:
+    """A sentence on how the photos of a scene were placed, empty where its report does not say."""
+    record = _read(folder)
+    placed, doubtful = record.get("placed", {}), record.get("doubtful", {})
+    if not placed or not isinstance(placed, dict):
+        return ""
+    later = sum(how["placed_by"] != "first" for how in placed.values())
+    weakest = sorted(placed, key=lambda name: placed[name]["points"])[:3]
+    least = ", ".join(f"{printable(name)} ({placed[name]['points']} points)" for name in weakest)
+    return (
+        f"{len(placed)} photos have a pose, {later} of them by a second or third chance; {len(doubtful)} are"
+        f" doubtful. The least sure: {least}."
+    )
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    try:
+        record = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
