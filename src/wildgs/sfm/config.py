@@ -37,7 +37,7 @@ class SfmConfig:
     affine_features: bool = True
     """Whether features have an affine shape, which survives oblique views; finding them takes 1.4 times as long."""
     second_chance: bool = True
-    """Whether photos without a pose are matched with more partners and tried again with fewer inliers."""
+    """Whether photos without a pose are matched to points, and with more partners, and tried again."""
     threads: int = -1
     """CPU threads; -1 = all."""
     seed: int = 0

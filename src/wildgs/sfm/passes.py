@@ -28,14 +28,11 @@ from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
-SECOND_NEIGHBOURS = 1
-"""Partners of a left-out photo at its second chance, relative to the first."""
-
 ENOUGH_MATCHES = 60
 """Pairs with so many are not matched again."""
 
-THIRD_ROUNDS = 3
-"""Photos that were placed by matches to points bring points for others."""
+POINT_ROUNDS = 3
+"""Photos that were placed by matches to points bring points for others: so many times."""
 
 LEAST_POINTS = 10
 """Sparse points of a photo that a second chance placed."""
@@ -75,21 +72,74 @@ def find_poses(
         models = map_photos(work, len(copies), config, progress)
         work.save_models("first", models)
     passes: dict[str, PassName] = {}
-    if config.second_chance and (not models or missing_from(models[0], copies)):
-        more = _second_pairs(work, copies, vlads, models, crops, config)
-        if not work.is_done("second matches"):
-            forget_pairs(work, copies, more)
-            show = counter(progress, "matching again")
-            match_pairs(work, copies, more, config, show, tolerant=True)
-            work.set_done("second matches")
+    if config.second_chance:
+        models, more = _try_again(work, copies, vlads, models, crops, passes, config, progress)
         pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
-        models = _try_again(work, copies, vlads, models, passes, config, progress)
     if not models:
         return None
     return Poses(models, pairing, passes, Findings(crops, drop_impossible(models[0])))
 
 
-def _second_pairs(
+def _try_again(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    models: list[Any],
+    crops: Mapping[int, int],
+    passes: dict[str, PassName],
+    config: SfmConfig,
+    progress: Progress,
+) -> tuple[list[Any], set[Pair]]:
+    """The second and third pass.
+
+    Returns:
+        All models, and the pairs that were matched again; `passes` notes which photos were placed.
+    """
+    if models:
+        models = _place_by_points(work, copies, vlads, models, passes, "second", config, progress)
+        if not missing_from(models[0], copies):
+            return models[:1], set()
+    more = _more_pairs(work, copies, vlads, models, crops, config)
+    if not work.is_done("more matches"):
+        forget_pairs(work, copies, more)
+        match_pairs(work, copies, more, config, counter(progress, "matching again"), tolerant=True)
+        work.set_done("more matches")
+    if not models:
+        return map_photos(work, len(copies), config, progress), more
+    main = continue_mapping(work, models[0], len(copies), config, progress)
+    _note_new(models[0], main, passes, "third")
+    models = _place_by_points(work, copies, vlads, [main], passes, "third", config, progress)
+    drop_unsure(models[0], work, passes)
+    rest = [copies[photo].work_name for photo in missing_from(models[0], copies)]
+    if len(rest) >= LEAST_GROUP:
+        models = [models[0], *map_photos(work, len(copies), config, progress, only=rest)]
+    return models, more
+
+
+def _place_by_points(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    models: list[Any],
+    passes: dict[str, PassName],
+    name: PassName,
+    config: SfmConfig,
+    progress: Progress,
+) -> list[Any]:
+    """The models, the first with the photos that matches to its points place; these bring points for others."""
+    main = models[0]
+    show = counter(progress, "matching to points")
+    for _ in range(POINT_ROUNDS):
+        if not match_to_points(work, copies, vlads, main, config.seed, show):
+            break
+        before, main = main, continue_mapping(work, main, len(copies), config, progress)
+        _note_new(before, main, passes, name)
+        if main.num_reg_images() == before.num_reg_images():
+            break
+    return [main, *models[1:]]
+
+
+def _more_pairs(
     work: Workplace,
     copies: Sequence[WorkingCopy],
     vlads: Float[Tensor, "N D"],
@@ -103,7 +153,7 @@ def _second_pairs(
     with closing(pycolmap.Database.open(work.database)) as database:
         matched = verified_pairs(database, copies)
     count = config.pairing.neighbours
-    wanted = {row: SECOND_NEIGHBOURS * count for row, photo in enumerate(kept) if photo in missing}
+    wanted = {row: count for row, photo in enumerate(kept) if photo in missing}
     alike = {(kept[a], kept[b]) for a, b in alike_pairs(vlads[kept], wanted)}
     friends = friends_of_friends(missing - set(crops), matched, count)
     return {
@@ -111,36 +161,6 @@ def _second_pairs(
         for pair in alike | friends
         if not set(pair) & set(crops) and matched.get(pair, 0) < ENOUGH_MATCHES
     }
-
-
-def _try_again(
-    work: Workplace,
-    copies: Sequence[WorkingCopy],
-    vlads: Float[Tensor, "N D"],
-    models: list[Any],
-    passes: dict[str, PassName],
-    config: SfmConfig,
-    progress: Progress,
-) -> list[Any]:
-    """Models after the second and third chance; notes in `passes` which photos they placed."""
-    if not models:
-        return map_photos(work, len(copies), config, progress)
-    main = continue_mapping(work, models[0], len(copies), config, progress)
-    _note_new(models[0], main, passes, "second")
-    for _ in range(THIRD_ROUNDS):
-        show = counter(progress, "matching to points")
-        if not missing_from(main, copies) or not match_to_points(
-            work, copies, vlads, main, config.seed, show
-        ):
-            break
-        before, main = main, continue_mapping(work, main, len(copies), config, progress)
-        _note_new(before, main, passes, "third")
-        if main.num_reg_images() == before.num_reg_images():
-            break
-    drop_unsure(main, work, passes)
-    rest = [copies[photo].work_name for photo in missing_from(main, copies)]
-    groups = map_photos(work, len(copies), config, progress, only=rest) if len(rest) >= LEAST_GROUP else []
-    return [main, *groups]
 
 
 def _names(model: Any) -> set[str]:

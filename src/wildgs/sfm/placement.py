@@ -27,8 +27,8 @@ class Placement:
     """How sure the pose of a photo is.
 
     Attributes:
-        placed_by: The first pass; the second, with more partners and fewer inliers; or the third, with matches to
-            points.
+        placed_by: The first pass; the second, with matches to points; or the third, with more partners and fewer
+            inliers.
         points: Sparse points that the photo observes.
         reprojection_error: Their mean error, pixels.
         neighbours: Photos that share 15 points or more with it.

@@ -1,4 +1,4 @@
-"""Third chance: features of a photo without a pose are matched to the points of the model instead of to photos.
+"""The second pass: features of a photo without a pose are matched to the points of the model instead of to photos.
 
 A point carries the descriptors of all photos that observe it, so that one of them is likely to resemble the new
 view, and Lowe's ratio compares points, not features: the same place in another photo is no rival. Poses of photos

@@ -46,10 +46,10 @@ def reconstruct(
 ) -> SfmReport:
     """Find the cameras of a folder of photos and write a scene that `load_scene` reads.
 
-    Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental with a second
-    chance for what it leaves out (`wildgs.sfm.passes`), and the largest model is kept and undistorted. CUDA is used
-    where pycolmap was built with it. SIGTERM and SIGHUP end the work as Ctrl-C does. What an interrupted call has
-    done lies in a hidden folder beside the output, and the same call continues there.
+    Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental with two
+    more passes for what it leaves out (`wildgs.sfm.passes`), and the largest model is kept and undistorted. CUDA is
+    used where pycolmap was built with it. SIGTERM and SIGHUP end the work as Ctrl-C does. What an interrupted call
+    has done lies in a hidden folder beside the output, and the same call continues there.
 
     Args:
         photos: Folder of photos, sub-folders included. It is only read.
