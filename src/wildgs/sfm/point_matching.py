@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
 from wildgs.progress import Counter
@@ -59,39 +59,42 @@ def match_to_points(
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
         placed = [row for row, copy in enumerate(copies) if find_registered(model, copy) is not None]
+        observed = [_observed(database, find_registered(model, copies[row])) for row in placed]
         for done, row in enumerate(missing):
             progress(done, len(missing))
             image_id = ids[row]
             if image_id is None or not database.num_keypoints_for_image(image_id):
                 continue
             nearest = (vlads[placed] @ vlads[row]).topk(min(MAX_PHOTOS, len(placed))).indices.tolist()
-            tracks = _seen_points(database, model, [ids[placed[place]] for place in nearest])
-            matches = _solve_photo(database, image_id, tracks, model, seed)
+            points = _index_points(model, [observed[place] for place in nearest])
+            matches = _solve_photo(database, image_id, points, seed)
             if matches is not None:
                 _write_matches(database, image_id, *matches, model)
                 found.append(copies[row].work_name)
     return found
 
 
-def _seen_points(
-    database: Any, model: Any, images: Sequence[int | None]
-) -> tuple[FeatureIndex, Int64[np.ndarray, " P"]]:
+Observed = tuple[UInt8[np.ndarray, "_ 128"], Int64[np.ndarray, " _"]]
+"""Descriptors of an image's features that observe points, and the points' ids."""
+
+
+def _observed(database: Any, image: Any) -> Observed:
+    rows = image.get_observation_point2D_idxs()
+    points = image.get_observation_points2D()
+    descriptors = np.array(database.read_descriptors(image.image_id).data[rows])
+    return descriptors, np.array([point.point3D_id for point in points], np.int64)
+
+
+def _index_points(model: Any, observed: Sequence[Observed]) -> tuple[FeatureIndex, Int64[np.ndarray, " P"]]:
     """Index of the points that some images observe, and the points' ids."""
-    descriptors, point_ids = [np.zeros((0, 128), np.uint8)], [np.zeros(0, np.int64)]
-    for image_id in images:
-        if image_id is None:
-            continue
-        points = model.image(image_id).points2D
-        rows = [row for row, point in enumerate(points) if point.has_point3D()]
-        descriptors.append(database.read_descriptors(image_id).data[rows])
-        point_ids.append(np.array([points[row].point3D_id for row in rows], np.int64))
-    unique, owners = np.unique(np.concatenate(point_ids), return_inverse=True)
+    unique, owners = np.unique(np.concatenate([ids for _, ids in observed]), return_inverse=True)
     places = np.array([model.point3D(point).xyz for point in unique], np.float64).reshape(-1, 3)
-    return FeatureIndex(np.concatenate(descriptors), owners.astype(np.int64), places), unique
+    descriptors = np.concatenate([descriptors for descriptors, _ in observed])
+    return FeatureIndex(descriptors, owners.astype(np.int64), places), unique
 
 
 def _solve_photo(
-    database: Any, image_id: int, seen: tuple[FeatureIndex, Int64[np.ndarray, " P"]], model: Any, seed: int
+    database: Any, image_id: int, seen: tuple[FeatureIndex, Int64[np.ndarray, " P"]], seed: int
 ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]] | None:
     """Features and ids of the points that agree with a pose, None where none is sure.
 
