@@ -14,7 +14,14 @@ import pytest
 from PIL import Image
 
 from wildgs.exporters.depth_colors import color_depth
-from wildgs.exporters.report import MethodScores, Report, ReportExample, ReportMask, write_report
+from wildgs.exporters.report import (
+    MethodScores,
+    Report,
+    ReportExample,
+    ReportMask,
+    ReportUnplaced,
+    write_report,
+)
 
 HOSTILE = """<script>alert("x")</script>'"&.jpg"""
 REASON = "LPIPS is null: its weights are not at hand"
@@ -246,3 +253,21 @@ def test_a_browser_shows_photo_and_render_side_by_side_and_nothing_overflows(
     assert np.nonzero(red)[1].max() < np.nonzero(green)[1].min() + 20, "photo left of the line, render right"
     margin = pixels[:, -8:]
     assert np.ptp(margin.reshape(-1, 3), axis=0).max() <= 8, "the page ends before its right edge"
+
+
+def test_photos_without_a_pose_are_shown_with_their_matches(tmp_path: Path) -> None:
+    unplaced = (
+        ReportUnplaced(HOSTILE, "too few matches", _flat(20, 60, (9, 90, 9))),
+        ReportUnplaced("blank.jpg", "no features found", None),
+    )
+    file = tmp_path / "report.html"
+    write_report(Report("t", "s", poses="8 photos have a pose.", unplaced=unplaced), file)
+    page = Page(file)
+    assert "8 photos have a pose." in page.text
+    assert HOSTILE in page.text
+    assert any("no features found" in text for text in page.text)
+    ((attributes, picture),) = page.pictures()
+    assert picture.size == (60, 20)
+    assert HOSTILE in str(attributes["alt"])
+    write_report(Report("t", "s"), file)
+    assert "Camera poses" not in Page(file).text

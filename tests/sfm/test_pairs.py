@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from wildgs.sfm.pairs import PairingConfig, choose_pairs, exhaustive_pairs, near_pairs, vlad_descriptors
+from wildgs.sfm.pairs import (
+    PairingConfig,
+    choose_pairs,
+    exhaustive_pairs,
+    friends_of_friends,
+    near_pairs,
+    vlad_descriptors,
+)
 
 
 def descriptors_of_places(photos: int, places: int) -> list[np.ndarray]:
@@ -18,7 +25,7 @@ def descriptors_of_places(photos: int, places: int) -> list[np.ndarray]:
 
 
 def test_small_sets_are_matched_all_with_all() -> None:
-    pairing = choose_pairs(5, lambda photo: np.zeros((0, 128), np.uint8), {}, PairingConfig())
+    pairing = choose_pairs(torch.zeros(5, 128), {}, PairingConfig())
     assert pairing == exhaustive_pairs(5)
     assert len(pairing.pairs) == 10
 
@@ -27,7 +34,7 @@ def test_retrieval_finds_photos_of_the_same_place() -> None:
     photos, places = 60, 6
     features = descriptors_of_places(photos, places)
     config = PairingConfig(exhaustive_limit=10, neighbours=9)
-    pairing = choose_pairs(photos, features.__getitem__, {}, config)
+    pairing = choose_pairs(vlad_descriptors(photos, features.__getitem__), {}, config)
     assert pairing.name == "retrieval"
     assert np.mean([a % places == b % places for a, b in pairing.pairs]) > 0.95
     assert list(pairing.pairs) == sorted(set(pairing.pairs))
@@ -38,7 +45,7 @@ def test_retrieval_finds_photos_of_the_same_place() -> None:
 def test_pairs_grow_with_the_photos_not_with_their_square(photos: int) -> None:
     features = descriptors_of_places(photos, photos // 4)
     config = PairingConfig(exhaustive_limit=10, neighbours=5)
-    assert len(choose_pairs(photos, features.__getitem__, {}, config).pairs) <= 5 * photos
+    assert len(choose_pairs(vlad_descriptors(photos, features.__getitem__), {}, config).pairs) <= 5 * photos
 
 
 def test_photos_without_features_do_not_disturb() -> None:
@@ -65,13 +72,21 @@ def test_gps_counts_where_enough_photos_carry_it() -> None:
     features = descriptors_of_places(photos, 3)
     config = PairingConfig(exhaustive_limit=10, neighbours=4, gps_share=0.8)
     line = {photo: (45.0, 7.0 + 1e-4 * photo) for photo in range(photos)}
-    pairing = choose_pairs(photos, features.__getitem__, line, config)
+    pairing = choose_pairs(vlad_descriptors(photos, features.__getitem__), line, config)
     assert pairing.name == "gps"
     assert all((photo, photo + 1) in pairing.pairs for photo in range(photos - 1))
 
     mostly = {photo: place for photo, place in line.items() if photo != 13}
-    pairs = choose_pairs(photos, features.__getitem__, mostly, config).pairs
+    pairs = choose_pairs(vlad_descriptors(photos, features.__getitem__), mostly, config).pairs
     partners = [a + b - 13 for a, b in pairs if 13 in (a, b)]
     assert len(partners) >= 4  # the photo without a position is found by its looks
     few = {photo: line[photo] for photo in range(10)}
-    assert choose_pairs(photos, features.__getitem__, few, config).name == "retrieval"
+    assert choose_pairs(vlad_descriptors(photos, features.__getitem__), few, config).name == "retrieval"
+
+
+def test_friends_of_friends_are_those_with_the_strongest_links() -> None:
+    matched = {(0, 1): 50, (1, 2): 40, (1, 3): 200, (3, 4): 300, (5, 6): 90}
+    assert friends_of_friends([0], matched, 5) == {(0, 2), (0, 3)}
+    assert friends_of_friends([0], matched, 1) == {(0, 3)}
+    assert friends_of_friends([4], matched, 5) == {(1, 4)}
+    assert friends_of_friends([7, 5], matched, 5) == set()

@@ -14,9 +14,11 @@ from PIL import Image
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.colmap import read_model
-from wildgs.sfm import mapping, reconstruction
+from wildgs.sfm import matching, reconstruction
 from wildgs.sfm.config import PairingConfig, SfmConfig
 from wildgs.sfm.reconstruction import reconstruct
+from wildgs.sfm.report import describe_placed, read_left_out
+from wildgs.sfm.workplace import Workplace
 
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
 EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3))
@@ -63,6 +65,7 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     whole = (folder / "photo 0.jpg").read_bytes()
     (folder / "broken.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "notes.txt").write_text("no photo")
+    Image.fromarray(photos[2][30:, 40:]).save(folder / "crop.png")
 
     steps: list[tuple[str, int, int]] = []
     with (
@@ -71,14 +74,31 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     ):
         report = reconstruct(folder, tmp_path / "scene", progress=lambda *step: steps.append(step))
 
-    names = ["phone/photo 3.jpg", "photo 0.jpg", "photo 1.jpg", "photo 2.jpg", "photo 4.jpg", "photo 5.jpg"]
+    names = [
+        "crop.jpg",
+        "phone/photo 3.jpg",
+        "photo 0.jpg",
+        "photo 1.jpg",
+        "photo 2.jpg",
+        "photo 4.jpg",
+        "photo 5.jpg",
+    ]
     assert report.registered == tuple(names)
-    assert report.photos == 8
+    assert report.photos == 9
     assert set(report.left_out) == {"blank.jpg", "broken.jpg"}
     assert "no features" in report.left_out["blank.jpg"]
     assert report.pairing == "exhaustive"
-    assert report.pairs == 21
-    assert ("reading photos", 8, 8) in steps
+    assert report.copies == {"crop.png": "photo 2.jpg"}
+    assert report.pairs == 22  # the crop is matched once
+    assert set(report.placed) == set(names)
+    assert all(how.placed_by == "first" and how.neighbours >= 2 for how in report.placed.values())
+    assert all(0 < how.reprojection_error < 1 for how in report.placed.values())
+    assert report.doubtful == {}
+    assert report.pictures == {}  # a blank photo matches none
+    left_out = {photo.name: photo for photo in read_left_out(tmp_path / "scene")}
+    assert left_out["blank.jpg"].picture is None
+    assert "7 photos have a pose, 0 of them by a second" in describe_placed(tmp_path / "scene")
+    assert ("reading photos", 9, 9) in steps
     assert steps[-1][0] == "undistorting"
     assert any("blank.jpg" in line for line in report.lines())
     stored = json.loads((tmp_path / "scene/sfm_report.json").read_text())
@@ -86,7 +106,7 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["my photos", "scene"]  # nothing is left behind
 
     centres = camera_centres(tmp_path / "scene")
-    order = [1, 2, 3, 0, 4, 5]
+    order = [2, 3, 4, 1, 5, 6]
     assert_similar(np.stack([centres[names[i]] for i in order]), np.stack(positions), tolerance=0.03)
 
     scene = load_scene(tmp_path / "scene", DataConfig(holdout=0))
@@ -94,11 +114,11 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     for view in scene.views:
         assert view.camera.width > view.camera.height  # upright
         assert view.camera.viewmat[1, 2] < -0.9 or view.camera.up[2] > 0.9
-    mask = scene.views[4].read_mask()
+    mask = scene.views[5].read_mask()
     assert mask is not None
     assert (mask[:, :50] == 0).all()
     assert (mask[:, 70:] == 255).all()
-    assert all(view.read_mask() is None for i, view in enumerate(scene.views) if i != 4)
+    assert all(view.read_mask() is None for i, view in enumerate(scene.views) if i != 5)
 
 
 def test_large_sets_are_paired_by_looks(tmp_path: Path, corner: Corner) -> None:
@@ -302,8 +322,10 @@ def test_options_that_mean_nothing_are_refused() -> None:
 @pytest.mark.parametrize(
     ("number", "stage"), [(signal.SIGTERM, "finding features"), (signal.SIGHUP, "finding poses")]
 )
-def test_signals_leave_nothing_behind(tmp_path: Path, corner: Corner, number: int, stage: str) -> None:
-    """A scheduler's SIGTERM, a terminal that is closed: no stack of C++, no copies of the photos."""
+def test_after_a_signal_the_same_call_continues(
+    tmp_path: Path, corner: Corner, monkeypatch: pytest.MonkeyPatch, number: int, stage: str
+) -> None:
+    """A scheduler's SIGTERM, a terminal that is closed: no stack of C++, and the work done is there."""
     photos = save_photos(tmp_path / "p", corner[0][:4])
     code = (
         "import os, sys; from pathlib import Path; from wildgs.cli import sfm\n"
@@ -314,7 +336,10 @@ def test_signals_leave_nothing_behind(tmp_path: Path, corner: Corner, number: in
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
     assert "TerminatedError: terminated" in ended.stderr
     assert "***" not in ended.stderr
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["p"]
+    assert "the same command continues" in ended.stderr
+    monkeypatch.setattr(reconstruction, "copy_upright", None)  # not called again
+    assert len(reconstruct(photos, tmp_path / "out").registered) == 4
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "p"]
 
 
 def test_folders_of_others_are_never_written_over(tmp_path: Path, corner: Corner) -> None:
@@ -373,14 +398,14 @@ def test_sacre_coeur_registers_by_retrieval(tmp_path: Path, shared: Path) -> Non
 
 def test_colmap_decodes_no_more_at_once_than_we_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its threads keep whole pictures: four of 240 megapixels took 10 GB."""
-    work = mapping.Workplace(tmp_path)
+    work = Workplace(tmp_path)
     work.images.mkdir()
     sides = [10, 10, 10, 40, 10, 10]
     for number, side in enumerate(sides):
         Image.new("RGB", (side, side)).save(work.images / f"{number}.jpg")
-    monkeypatch.setattr(mapping, "DECODING_PIXELS", 250)
+    monkeypatch.setattr(matching, "DECODING_PIXELS", 250)
     names = [f"{number}.jpg" for number in range(6)]
-    assert list(mapping._batches(work, names)) == [names[:2], names[2:3], names[3:4], names[4:]]
-    monkeypatch.setattr(mapping, "DECODING_PIXELS", 10**6)
-    monkeypatch.setattr(mapping, "EXTRACTION_BATCH", 4)
-    assert list(mapping._batches(work, names)) == [names[:4], names[4:]]
+    assert list(matching._batches(work, names)) == [names[:2], names[2:3], names[3:4], names[4:]]
+    monkeypatch.setattr(matching, "DECODING_PIXELS", 10**6)
+    monkeypatch.setattr(matching, "EXTRACTION_BATCH", 4)
+    assert list(matching._batches(work, names)) == [names[:4], names[4:]]

@@ -15,7 +15,8 @@ from wildgs.sfm.config import SfmConfig
 class Command:
     """Finds the cameras of a folder of photos (structure from motion) and writes a COLMAP scene.
 
-    Photos that cannot be registered are named with the likely reason; the others are not affected.
+    Photos that cannot be registered are named with the likely reason; the others are not affected. After an
+    interruption, the same command continues.
 
     Example: wildgs sfm photos/gate --output scenes/gate
     """

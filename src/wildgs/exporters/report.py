@@ -19,7 +19,7 @@ from wildgs.exporters.depth_colors import color_depth, tint_hidden
 from wildgs.exporters.report_scores import MethodScores, scores_section
 from wildgs.files import printable, written_aside
 
-__all__ = ["MethodScores", "Report", "ReportExample", "ReportMask", "write_report"]
+__all__ = ["MethodScores", "Report", "ReportExample", "ReportMask", "ReportUnplaced", "write_report"]
 
 Photo = UInt8[np.ndarray, "H W 3"]
 
@@ -73,6 +73,21 @@ class ReportMask:
 
 
 @dataclass(frozen=True)
+class ReportUnplaced:
+    """A photo without a pose.
+
+    Attributes:
+        name: Name of the photo.
+        reason: Why it has none.
+        matches: The photo beside its best partner with their matches, None where it matches none.
+    """
+
+    name: str
+    reason: str
+    matches: UInt8[np.ndarray, "H W 3"] | None
+
+
+@dataclass(frozen=True)
 class Report:
     """Content of a report.
 
@@ -83,6 +98,8 @@ class Report:
         examples: Views, from top to bottom.
         misfits: Training photos that fit no light, worst first.
         masks: Other training photos and their masks, worst first.
+        poses: How photos were placed.
+        unplaced: Photos without a pose.
     """
 
     title: str
@@ -91,6 +108,8 @@ class Report:
     examples: tuple[ReportExample, ...] = ()
     misfits: tuple[ReportMask, ...] = ()
     masks: tuple[ReportMask, ...] = ()
+    poses: str = ""
+    unplaced: tuple[ReportUnplaced, ...] = ()
 
 
 def escape(text: str) -> str:
@@ -110,7 +129,10 @@ def write_report(report: Report, file: Path) -> None:
         title=escape(report.title),
         summary=escape(report.summary),
         scores=scores_section(report.methods),
-        examples=_examples(report.examples) + _misfits(report.misfits) + _masks(report.masks),
+        examples=_examples(report.examples)
+        + _misfits(report.misfits)
+        + _masks(report.masks)
+        + _poses(report),
         footer="Written by Wild-GS. All pictures are embedded; nothing is loaded from the network.",
     )
     with written_aside(file) as aside:
@@ -141,6 +163,23 @@ def _masks(photos: Sequence[ReportMask]) -> str:
         "is wrong. Photos that lose most of them come first. "
     )
     return _beside_masks("Masks of training photos", hint, photos)
+
+
+def _poses(report: Report) -> str:
+    if not report.poses:
+        return ""
+    figures = []
+    for photo in report.unplaced:
+        name = escape(photo.name)
+        picture = "" if photo.matches is None else _picture(photo.matches, f"Matches of {name}")
+        figures.append(
+            f"<figure>{picture}<figcaption><b>{name}</b>: {escape(photo.reason)}</figcaption></figure>"
+        )
+    text = f'<section><h2>Camera poses</h2><p class="hint">{escape(report.poses)}</p>'
+    if figures:
+        hint = "Photos without a pose, beside the photo that they match best; lines join features that agree."
+        text += f'<h3>Left out</h3><p class="hint">{hint}</p><div class="masks">{"".join(figures)}</div>'
+    return text + "</section>"
 
 
 def _beside_masks(title: str, hint: str, photos: Sequence[ReportMask]) -> str:

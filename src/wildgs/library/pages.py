@@ -14,7 +14,14 @@ from torch import Tensor
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.photos import PhotoFit, find_misfits, read_photos
 from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
-from wildgs.exporters.report import MethodScores, Report, ReportExample, ReportMask, write_report
+from wildgs.exporters.report import (
+    MethodScores,
+    Report,
+    ReportExample,
+    ReportMask,
+    ReportUnplaced,
+    write_report,
+)
 from wildgs.exporters.splats import CleanupConfig, Splats, kept_rows
 from wildgs.geometry.trajectory import spread_out
 from wildgs.library.day import find_day, has_day, in_order_of_day, viewpoints_of
@@ -27,6 +34,8 @@ from wildgs.model.method import Method
 from wildgs.progress import Progress
 from wildgs.runs import Run
 from wildgs.scene import Scene, View, match_view
+from wildgs.scene.images import read_photo
+from wildgs.sfm.report import describe_placed, read_left_out
 
 PAGE_LIGHTS = 6
 
@@ -163,6 +172,11 @@ def write_showcase(
         examples,
         misfits=_beside_masks(shown, scene, misfits[:MISFITS]),
         masks=_beside_masks(shown, scene, others[:MASKS]),
+        poses=describe_placed(scene.root),
+        unplaced=tuple(
+            ReportUnplaced(photo.name, photo.reason, photo.picture and read_photo(photo.picture).pixels)
+            for photo in read_left_out(scene.root)
+        ),
     )
     write_report(report, file)
 

@@ -12,9 +12,9 @@ from wildgs.scene.config import MAX_IMAGE_PIXELS
 class PairingConfig:
     """When and how partners are chosen."""
 
-    exhaustive_limit: int = 200
+    exhaustive_limit: int = 40
     """Sets of up to this many photos are matched all with all."""
-    neighbours: int = 40
+    neighbours: int = 16
     """Partners per photo in larger sets."""
     gps_share: float = 0.8
     """Share of the photos that must carry a GPS position for neighbours to be chosen by it."""
@@ -34,6 +34,10 @@ class SfmConfig:
     """Features per photo."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
     """Photos with more pixels are left out."""
+    affine_features: bool = True
+    """Whether features have an affine shape, which survives oblique views; finding them takes 1.4 times as long."""
+    second_chance: bool = True
+    """Whether photos without a pose are matched to points, and with more partners, and tried again."""
     threads: int = -1
     """CPU threads; -1 = all."""
     seed: int = 0

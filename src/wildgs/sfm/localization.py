@@ -101,7 +101,7 @@ def localize(file: Path, index: FeatureIndex, long_side: int, *, seed: int = 0) 
     matched, seen = (np.zeros(0, np.int64),) * 2
     if len(features):
         matched, seen = match_features(descriptors, index, MATCH_RATIO)
-    answer = _solve(features[matched], index.points[seen], camera, known, seed)
+    answer = solve_pose(features[matched], index.points[seen], camera, known, seed)
     inliers = 0 if answer is None else int(answer["num_inliers"])
     if answer is None or inliers < MIN_INLIERS:
         raise LocalizationError(
@@ -137,7 +137,7 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
     return camera, known
 
 
-def _solve(
+def solve_pose(
     pixels: Float64[np.ndarray, "M 2"],
     points: Float64[np.ndarray, "M 3"],
     camera: Any,

@@ -1,54 +1,28 @@
-"""The steps of structure from motion by pycolmap: features, pairs, matches, poses."""
+"""Poses by pycolmap's incremental mapping, and a second chance for the photos that it leaves out.
+
+Source: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
+"""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import pycolmap
 
-from wildgs.errors import UserError
 from wildgs.progress import Progress
-from wildgs.scene.images import DECODING_PIXELS, open_image
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.pairs import Pairing, choose_pairs
+from wildgs.sfm.lenses import FOCAL_RANGE
 from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.workplace import Workplace
 
-EXTRACTION_BATCH = 16
-MATCHING_BLOCK = 50
-"""Photos per block of pairs: COLMAP keeps the features of two blocks in memory."""
+LEAST_GROUP = 3
+"""Photos of the smallest model that is looked for."""
 
-
-@dataclass(frozen=True)
-class Workplace:
-    """Temporary folders and files beside the output."""
-
-    root: Path
-
-    @property
-    def images(self) -> Path:
-        """The upright copies."""
-        return self.root / "images"
-
-    @property
-    def masks(self) -> Path:
-        """Masks of transparent pixels, by copy; absent where no photo has any."""
-        return self.root / "masks"
-
-    @property
-    def database(self) -> Path:
-        """Features and matches."""
-        return self.root / "database.db"
-
-    @property
-    def scene(self) -> Path:
-        """The finished scene before it moves to its place."""
-        return self.root / "scene"
+LATE_INLIERS = 15
+"""Inliers with which a photo is placed at its second chance; the first asks for 30."""
+LATE_INLIER_RATIO = 0.1
 
 
 @contextmanager
@@ -62,92 +36,53 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = previous
 
 
-def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> None:
-    """Find SIFT features in all copies, with a camera of its own for each."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = config.max_image_size
-    options.num_threads = config.threads
-    options.sift.max_num_features = config.max_features
-    done = 0
-    # COLMAP passes over photos without a mask once it is given a folder of masks, so these go apart.
-    for masked in (False, True):
-        reader = pycolmap.ImageReaderOptions()
-        if masked:
-            reader.mask_path = work.masks
-        names = [copy.work_name for copy in copies if copy.masked == masked]
-        for batch in _batches(work, names):
-            progress("finding features", done, len(copies))
-            pycolmap.extract_features(
-                work.database,
-                work.images,
-                batch,
-                pycolmap.CameraMode.PER_IMAGE,
-                reader_options=reader,
-                extraction_options=options,
-            )
-            done += len(batch)
-    progress("finding features", done, len(copies))
-
-
-def _batches(work: Workplace, names: Sequence[str]) -> Iterator[list[str]]:
-    """Copies that COLMAP may decode at the same time: its threads keep whole pictures."""
-    batch: list[str] = []
-    pixels = 0
-    for name in names:
-        with open_image(work.images / name, sys.maxsize) as image:
-            own = image.width * image.height
-        if batch and (len(batch) == EXTRACTION_BATCH or pixels + own > DECODING_PIXELS):
-            yield batch
-            batch, pixels = [], 0
-        batch.append(name)
-        pixels += own
-    if batch:
-        yield batch
-
-
-def match(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> Pairing:
-    """Choose the pairs, match their features and verify the matches by epipolar geometry."""
-    with closing(pycolmap.Database.open(work.database)) as database:
-        ids = image_ids(database, copies)
-        positions = {i: copy.position for i, copy in enumerate(copies) if copy.position is not None}
-
-        def descriptors(photo: int) -> np.ndarray:
-            image_id = ids[photo]
-            if image_id is None or not database.exists_descriptors(image_id):
-                return np.zeros((0, 128), dtype=np.uint8)
-            return database.read_descriptors(image_id).data
-
-        progress("choosing pairs", 0, 0)
-        pairing = choose_pairs(len(copies), descriptors, positions, config.pairing, config.seed)
-
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = config.threads
-    lists = work.root / "pairs.txt"
-    # Pairs of the same two blocks of photos go together, so that features are read once per block.
-    pairs = sorted(
-        pairing.pairs, key=lambda pair: (pair[0] // MATCHING_BLOCK, pair[1] // MATCHING_BLOCK, pair)
+def map_photos(
+    work: Workplace, count: int, config: SfmConfig, progress: Progress, only: Sequence[str] = ()
+) -> list[Any]:
+    """All models by incremental mapping, the largest first; of some working copies, or of all."""
+    options = _options(config)
+    options.image_names = list(only)
+    models = pycolmap.incremental_mapping(
+        work.database,
+        work.images,
+        work.fresh("mapping"),
+        options,
+        next_image_callback=_counted(progress, 2, count),  # a model starts from a pair
     )
-    for start in range(0, len(pairs), MATCHING_BLOCK**2):
-        progress("matching pairs", start, len(pairs))
-        chunk = pairs[start : start + MATCHING_BLOCK**2]
-        lists.write_text("".join(f"{copies[a].work_name} {copies[b].work_name}\n" for a, b in chunk))
-        pycolmap.match_image_pairs(
-            work.database,
-            matching_options=options,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(lists)),
-        )
-    progress("matching pairs", len(pairs), len(pairs))
-    return pairing
+    return by_size(models.values())
 
 
-def map_photos(work: Workplace, photos: Path, count: int, config: SfmConfig, progress: Progress) -> list[Any]:
-    """All models, the largest first."""
+def continue_mapping(work: Workplace, model: Any, count: int, config: SfmConfig, progress: Progress) -> Any:
+    """The model with the photos that match it now, or with fewer inliers than the first pass asks for."""
+    start = work.fresh("start")
+    model.write(start)
+    options = _options(config)
+    options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
+    options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
+    options.multiple_models = False
+    models = pycolmap.incremental_mapping(
+        work.database,
+        work.images,
+        work.fresh("mapping"),
+        options,
+        input_path=start,
+        next_image_callback=_counted(progress, model.num_reg_images(), count),
+    )
+    largest = by_size(models.values())
+    return largest[0] if largest and largest[0].num_reg_images() >= model.num_reg_images() else model
+
+
+def _options(config: SfmConfig) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = config.threads
     options.random_seed = config.seed
-    options.min_model_size = min(options.min_model_size, max(2, count // 4))
-    (work.root / "models").mkdir()
-    done = 2  # a model starts from a pair
+    options.min_model_size = LEAST_GROUP
+    options.min_focal_length_ratio, options.max_focal_length_ratio = FOCAL_RANGE
+    return options
+
+
+def _counted(progress: Progress, start: int, count: int) -> Callable[[], None]:
+    done = start
 
     def count_photo() -> None:
         nonlocal done
@@ -155,24 +90,20 @@ def map_photos(work: Workplace, photos: Path, count: int, config: SfmConfig, pro
         progress("finding poses", min(done, count), count)
 
     progress("finding poses", 0, count)
-    models = pycolmap.incremental_mapping(
-        work.database, work.images, work.root / "models", options, next_image_callback=count_photo
-    )
-    if not models:
-        raise UserError(
-            f"{photos}: the {count} photos do not match each other, so they have no poses; photos of one"
-            " place with much overlap are needed"
-        )
-    return sorted(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+    return count_photo
 
 
-def image_ids(database: Any, copies: Sequence[WorkingCopy]) -> list[int | None]:
-    """The database's ids; None for photos that COLMAP could not read."""
-    ids = {image.name: int(image.image_id) for image in database.read_all_images()}
-    return [ids.get(copy.work_name) for copy in copies]
+def by_size(models: Collection[Any]) -> list[Any]:
+    """Models, the largest first."""
+    return sorted(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
 
 
 def find_registered(model: Any, copy: WorkingCopy) -> Any | None:
     """The photo's image in a model, None where it has no pose there."""
     image = model.find_image_with_name(copy.work_name)
     return image if image is not None and image.has_pose else None
+
+
+def missing_from(model: Any, copies: Sequence[WorkingCopy]) -> list[int]:
+    """The photos without a pose in a model."""
+    return [row for row, copy in enumerate(copies) if find_registered(model, copy) is None]

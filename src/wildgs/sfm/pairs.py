@@ -1,4 +1,4 @@
-"""Pairs of photos to match: all of them for small sets, near neighbours for large ones.
+"""Pairs of photos to match: all of them for small sets, near neighbours for large ones, and friends of friends.
 
 Neighbours come from GPS positions if enough photos have one, else from retrieval by VLAD descriptors (Jegou et al.,
 "Aggregating local descriptors into a compact image representation", CVPR 2010) of the SIFT features, for which no
@@ -7,7 +7,8 @@ vocabulary has to be downloaded.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -21,6 +22,8 @@ from torch import Tensor
 from wildgs.sfm.config import PairingConfig
 
 PairingName = Literal["exhaustive", "gps", "retrieval"]
+Pair = tuple[int, int]
+"""Indices of two photos, the lower first."""
 
 EARTH_RADIUS = 6_371_000.0
 VLAD_WORDS = 64
@@ -35,7 +38,7 @@ class Pairing:
     """Pairs of photos to match, as indices (low, high), sorted, without repetition."""
 
     name: PairingName
-    pairs: tuple[tuple[int, int], ...]
+    pairs: tuple[Pair, ...]
 
 
 def exhaustive_pairs(count: int) -> Pairing:
@@ -43,7 +46,7 @@ def exhaustive_pairs(count: int) -> Pairing:
     return Pairing("exhaustive", tuple(combinations(range(count), 2)))
 
 
-def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set[tuple[int, int]]:
+def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set[Pair]:
     """Photos with the most similar ones, by their unit vectors; `partners` is how many to find by photo."""
     pairs = set()
     for photo, wanted in partners.items():
@@ -57,7 +60,14 @@ def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set
 def vlad_descriptors(
     count: int, read_descriptors: Callable[[int], Shaped[np.ndarray, "F 128"]], seed: int = 0
 ) -> Float[Tensor, "N D"]:
-    """One unit vector a photo: SIFT residuals from the nearest words, normalised per word."""
+    """One unit vector a photo: SIFT residuals from the nearest words, normalised per word.
+
+    Args:
+        count: Number of photos.
+        read_descriptors: SIFT descriptors of a photo, the most reliable first (COLMAP sorts by scale); may be
+            empty.
+        seed: Of the training of the visual words.
+    """
     generator = torch.Generator().manual_seed(seed)
     share = max(1, VLAD_TRAINING // max(count, 1))
     training = []
@@ -104,7 +114,7 @@ def _vlad(features: Float[Tensor, "F 128"], words: Float[Tensor, "K 128"]) -> Fl
 
 def near_pairs(
     positions: Mapping[int, tuple[float, float]], neighbours: int, max_distance: float
-) -> set[tuple[int, int]]:
+) -> set[Pair]:
     """Photos with the nearest ones.
 
     Args:
@@ -132,12 +142,30 @@ def near_pairs(
     return pairs
 
 
+def friends_of_friends(photos: Iterable[int], matched: Mapping[Pair, int], limit: int) -> set[Pair]:
+    """Photos with those that match their partners: what retrieval overlooks, a common partner knows.
+
+    Args:
+        photos: For whom partners are sought.
+        matched: Number of matches of the pairs that were verified.
+        limit: Partners per photo; those come first whose weaker link to a common partner is the strongest.
+    """
+    partners: dict[int, dict[int, int]] = defaultdict(dict)
+    for (a, b), matches in matched.items():
+        partners[a][b] = partners[b][a] = matches
+    pairs = set()
+    for photo in photos:
+        links: Counter[int] = Counter()
+        for friend, matches in partners[photo].items():
+            for other, more in partners[friend].items():
+                if other != photo and other not in partners[photo]:
+                    links[other] = max(links[other], min(matches, more))
+        pairs.update((min(photo, other), max(photo, other)) for other, _ in links.most_common(limit))
+    return pairs
+
+
 def choose_pairs(
-    count: int,
-    read_descriptors: Callable[[int], Shaped[np.ndarray, "F 128"]],
-    positions: Mapping[int, tuple[float, float]],
-    config: PairingConfig,
-    seed: int = 0,
+    vlads: Float[Tensor, "N D"], positions: Mapping[int, tuple[float, float]], config: PairingConfig
 ) -> Pairing:
     """All pairs of a small set; of a large one, each photo with its neighbours by GPS or by retrieval.
 
@@ -145,16 +173,14 @@ def choose_pairs(
     are far apart; photos without a near neighbour get all of their partners by it.
 
     Args:
-        count: Number of photos.
-        read_descriptors: SIFT descriptors of a photo, the most reliable first (COLMAP sorts by scale); may be
-            empty.
+        vlads: Of all photos.
         positions: Latitude and longitude in degrees of the photos that carry them.
         config: Limits.
-        seed: Of the training of the visual words.
     """
+    count = len(vlads)
     if count <= config.exhaustive_limit:
         return exhaustive_pairs(count)
-    near: set[tuple[int, int]] = set()
+    near: set[Pair] = set()
     if len(positions) >= config.gps_share * count:
         near = near_pairs(positions, config.neighbours, config.gps_distance)
     placed = {photo for pair in near for photo in pair}
@@ -162,5 +188,5 @@ def choose_pairs(
         photo: max(1, config.neighbours // 4) if photo in placed else config.neighbours
         for photo in range(count)
     }
-    alike = alike_pairs(vlad_descriptors(count, read_descriptors, seed), partners)
+    alike = alike_pairs(vlads, partners)
     return Pairing("gps" if near else "retrieval", tuple(sorted(near | alike)))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,19 +20,17 @@ from wildgs.scene.colmap import LAYOUTS
 from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.mapping import (
-    Workplace,
-    extract,
-    find_registered,
-    image_ids,
-    map_photos,
-    match,
-    quiet,
-)
+from wildgs.sfm.lookalikes import find_doubtful
+from wildgs.sfm.mapping import find_registered, quiet
+from wildgs.sfm.match_pictures import FOLDER as PICTURES
+from wildgs.sfm.match_pictures import write_match_pictures
+from wildgs.sfm.passes import find_poses
+from wildgs.sfm.placement import failures, placements
 from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
+from wildgs.sfm.workplace import Workplace, open_workplace
 
-SCENE_PARTS = ("images", "sparse", "masks", REPORT_NAME)
+SCENE_PARTS = ("images", "sparse", "masks", PICTURES, REPORT_NAME)
 ASIDE, MOVED, DONE = ".replaced", ".moved", ".done"
 """Folder of the old scene while the new one takes its place, and the files in it that say that the old scene is
 complete there, and that the new one is in its place."""
@@ -49,9 +46,10 @@ def reconstruct(
 ) -> SfmReport:
     """Find the cameras of a folder of photos and write a scene that `load_scene` reads.
 
-    Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental, and
-    the largest model is kept and undistorted. CUDA is used where pycolmap was built with it. SIGTERM and SIGHUP
-    end the work as Ctrl-C does; nothing temporary is left.
+    Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental with two
+    more passes for what it leaves out (`wildgs.sfm.passes`), and the largest model is kept and undistorted. CUDA is
+    used where pycolmap was built with it. SIGTERM and SIGHUP end the work as Ctrl-C does. What an interrupted call
+    has done lies in a hidden folder beside the output, and the same call continues there.
 
     Args:
         photos: Folder of photos, sub-folders included. It is only read.
@@ -83,49 +81,64 @@ def _reconstruct(
     _restore(output)
     _check_output(photos, output, overwrite)
     output.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        signals_as_interrupts(),
-        tempfile.TemporaryDirectory(dir=output.parent, prefix=".wildgs-sfm-") as folder,
-        quiet(),
-    ):
-        work = Workplace(Path(folder))
-        copies, broken = copy_upright(
-            photos,
-            work.images,
-            work.masks,
-            max_pixels=config.max_image_pixels,
-            progress=lambda done, total: progress("reading photos", done, total),
-        )
+    with signals_as_interrupts(), open_workplace(photos, output, config) as work, quiet():
+        copies, broken = _copy(work, photos, config, progress)
         if len(copies) < 2:
             raise UserError(
                 f"{photos}: holds {len(copies)} photo(s) that can be read; poses need at least two of the"
                 " same place, better twenty"
             )
         pycolmap.set_random_seed(config.seed)
-        extract(work, copies, config, progress)
-        pairing = match(work, copies, config, progress)
-        models = map_photos(work, photos, len(copies), config, progress)
+        poses = find_poses(work, copies, config, progress)
+        if poses is None:
+            raise UserError(
+                f"{photos}: the {len(copies)} photos do not match each other, so they have no poses; photos of one"
+                " place with much overlap are needed"
+            )
+        model = poses.models[0]
         progress("undistorting", 0, 0)
-        _write_scene(work, copies, models[0])
+        _write_scene(work, copies, model)
+        without = failures(work, copies, poses.models, poses.findings)
+        names = {copy.work_name: copy.scene_name for copy in copies}
         report = SfmReport(
             photos=len(copies) + len(broken),
-            registered=tuple(
-                sorted(c.scene_name for c in copies if find_registered(models[0], c) is not None)
-            ),
-            left_out={**broken, **_reasons(work, copies, models)},
-            points=models[0].num_points3D(),
-            reprojection_error=float(models[0].compute_mean_reprojection_error()),
-            pairing=pairing.name,
-            pairs=len(pairing.pairs),
-            models=tuple(model.num_reg_images() for model in models),
+            registered=tuple(sorted(c.scene_name for c in copies if find_registered(model, c) is not None)),
+            left_out={**broken, **{name: failure.reason for name, failure in without.items()}},
+            points=model.num_points3D(),
+            reprojection_error=float(model.compute_mean_reprojection_error()),
+            pairing=poses.pairing.name,
+            pairs=len(poses.pairing.pairs),
+            models=tuple(other.num_reg_images() for other in poses.models),
             seconds=time.perf_counter() - started,
             renamed={c.name: c.scene_name for c in copies if _is_renamed(c)},
             masks=_files_in(work.scene / "masks"),
+            placed=placements(model, copies, poses.passes),
+            copies={copies[a].name: copies[b].name for a, b in poses.findings.crops.items()},
+            pictures=write_match_pictures(work, copies, without),
+            doubtful={names[n]: why for n, why in find_doubtful(model, work.database, names).items()},
         )
         report.write(work.scene)
         _check_output(photos, output, overwrite)  # another process may have been faster
         _move_in(work.scene, output)
     return report
+
+
+def _copy(
+    work: Workplace, photos: Path, config: SfmConfig, progress: Progress
+) -> tuple[list[WorkingCopy], dict[str, str]]:
+    """The working copies, those of an interrupted reconstruction where they are complete."""
+    kept = work.load_copies()
+    if kept is not None:
+        return kept
+    copies, broken = copy_upright(
+        photos,
+        work.images,
+        work.masks,
+        max_pixels=config.max_image_pixels,
+        progress=lambda done, total: progress("reading photos", done, total),
+    )
+    work.save_copies(copies, broken)
+    return copies, broken
 
 
 def check_photos(photos: Path, output: Path) -> None:
@@ -251,8 +264,8 @@ def _keep(folder: Path, output: Path) -> str:
 
 def _write_scene(work: Workplace, copies: Sequence[WorkingCopy], model: Any) -> None:
     """Undistort the photos of the model and give them their names back."""
-    kept, dense = work.root / "kept", work.root / "dense"
-    kept.mkdir()
+    kept, dense = work.fresh("kept"), work.fresh("dense")
+    work.fresh("scene")
     model.write(kept)
     pycolmap.undistort_images(dense, kept, work.images, jpeg_quality=JPEG_QUALITY)
     pinhole = pycolmap.Reconstruction(dense / "sparse")
@@ -277,30 +290,3 @@ def _write_mask(work: Workplace, copy: WorkingCopy, camera: Any) -> None:
     target = work.scene / "masks" / f"{copy.scene_name}.png"
     target.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(mask if source is None else sample_mask(mask, source)).save(target)
-
-
-def _reasons(work: Workplace, copies: Sequence[WorkingCopy], models: Sequence[Any]) -> dict[str, str]:
-    """Why the photos without a pose in the kept model have none."""
-    with closing(pycolmap.Database.open(work.database)) as database:
-        ids = image_ids(database, copies)
-        names = {image_id: copy.name for image_id, copy in zip(ids, copies, strict=True)}
-        best: dict[int, tuple[int, int]] = {}
-        for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
-            a, b = pycolmap.pair_id_to_image_pair(pair_id)
-            best[a] = max(best.get(a, (0, 0)), (inliers, b))
-            best[b] = max(best.get(b, (0, 0)), (inliers, a))
-        reasons = {}
-        for image_id, copy in zip(ids, copies, strict=True):
-            if find_registered(models[0], copy) is not None:
-                continue
-            other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
-            inliers, partner = best.get(image_id, (0, 0)) if image_id is not None else (0, 0)
-            if image_id is None or database.num_keypoints_for_image(image_id) == 0:
-                reasons[copy.name] = "no features found (blank, blurred or very small)"
-            elif other is not None:
-                reasons[copy.name] = f"belongs to a separate group of {other.num_reg_images()} photos"
-            elif inliers == 0:
-                reasons[copy.name] = "matches no other photo"
-            else:
-                reasons[copy.name] = f"too few matches ({inliers} at best, with {names[partner]})"
-    return reasons

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from wildgs.files import printable
+from wildgs.scene.colmap import describe_names
 from wildgs.sfm.pairs import PairingName
+from wildgs.sfm.placement import Placement
 
 REPORT_NAME = "sfm_report.json"
 
@@ -29,6 +32,10 @@ class SfmReport:
         pairs: How many pairs were matched.
         models: Sizes of all models found, largest first; the first is kept.
         seconds: Time taken.
+        placed: How sure each pose is, by name in the scene.
+        copies: From copies and crops of a photo to the photo.
+        doubtful: From the names of photos with a pose to what contradicts it.
+        pictures: From the names of photos without a pose to pictures of their best matches, files of the scene.
     """
 
     photos: int
@@ -42,6 +49,10 @@ class SfmReport:
     seconds: float
     renamed: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[str, ...] = ()
+    placed: Mapping[str, Placement] = field(default_factory=dict)
+    copies: Mapping[str, str] = field(default_factory=dict)
+    doubtful: Mapping[str, str] = field(default_factory=dict)
+    pictures: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """The report in plain sentences."""
@@ -50,6 +61,16 @@ class SfmReport:
             f" {self.reprojection_error:.2f} px mean reprojection error"
             f" ({self.pairs} pairs, {self.pairing}, {self.seconds:.0f} s)"
         ]
+        later = [name for name, how in self.placed.items() if how.placed_by != "first"]
+        if later:
+            text.append(f"{len(later)} of them at a second or third chance: {_some(later)}")
+        if self.copies:
+            text.append(
+                f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"
+            )
+        if self.doubtful:
+            text.append(f"{len(self.doubtful)} poses are doubtful (look-alikes, or wrong):")
+            text += [f"  {printable(name)}: {why}" for name, why in sorted(self.doubtful.items())]
         if self.left_out:
             text.append(
                 f"{len(self.left_out)} photos have no pose and take no part; the others are not affected:"
@@ -67,10 +88,56 @@ class SfmReport:
         (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
+def _some(names: Sequence[str]) -> str:
+    return describe_names([printable(name) for name in names])
+
+
 def read_masks(folder: Path) -> list[str]:
     """The masks that an earlier report lists; none if there is no report, or an older one without the list."""
-    try:
-        masks = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8")).get("masks", [])
-    except (OSError, ValueError, AttributeError):
-        return []
+    masks = _read(folder).get("masks", [])
     return [str(name) for name in masks] if isinstance(masks, list) else []
+
+
+@dataclass(frozen=True)
+class LeftOutPhoto:
+    """A photo without a pose, the reason, and the picture of its best matches, where there is one."""
+
+    name: str
+    reason: str
+    picture: Path | None
+
+
+def read_left_out(folder: Path) -> list[LeftOutPhoto]:
+    """The photos without a pose that the report of a scene lists, with their pictures."""
+    record = _read(folder)
+    reasons, pictures = record.get("left_out", {}), record.get("pictures", {})
+    if not isinstance(reasons, dict) or not isinstance(pictures, dict):
+        return []
+    files = {name: folder / str(picture) for name, picture in pictures.items()}
+    return [
+        LeftOutPhoto(name, str(reason), files[name] if name in files and files[name].is_file() else None)
+        for name, reason in sorted(reasons.items())
+    ]
+
+
+def describe_placed(folder: Path) -> str:
+    """A sentence on how the photos of a scene were placed, empty where its report does not say."""
+    record = _read(folder)
+    placed, doubtful = record.get("placed", {}), record.get("doubtful", {})
+    if not placed or not isinstance(placed, dict):
+        return ""
+    later = sum(how["placed_by"] != "first" for how in placed.values())
+    weakest = sorted(placed, key=lambda name: placed[name]["points"])[:3]
+    least = ", ".join(f"{printable(name)} ({placed[name]['points']} points)" for name in weakest)
+    return (
+        f"{len(placed)} photos have a pose, {later} of them by a second or third chance; {len(doubtful)} are"
+        f" doubtful. The least sure: {least}."
+    )
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    try:
+        record = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}

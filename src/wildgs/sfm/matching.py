@@ -1,0 +1,195 @@
+"""Features, pairs and matches by pycolmap."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from torch import Tensor
+
+from wildgs.progress import Progress
+from wildgs.scene.images import DECODING_PIXELS, open_image
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.crops import CANDIDATE_LIKENESS, find_crops
+from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, choose_pairs, vlad_descriptors
+from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.workplace import Workplace
+
+EXTRACTION_BATCH = 16
+MATCHING_BLOCK = 50
+"""Photos per block of pairs: COLMAP keeps the features of two blocks in memory."""
+
+TOLERANT_RATIO = 0.85
+"""Largest distance to the best feature relative to the second best, at the second chance; 0.8 at the first."""
+TOLERANT_INLIER_RATIO = 0.1
+"""Share of correct matches for which RANSAC's trials suffice; 0.25 at the first chance."""
+
+
+def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> None:
+    """Find SIFT features in all copies, with a camera of its own for each."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = config.max_image_size
+    options.num_threads = config.threads
+    options.sift.max_num_features = config.max_features
+    options.sift.estimate_affine_shape = config.affine_features
+    done = 0
+    # COLMAP passes over photos without a mask once it is given a folder of masks, so these go apart.
+    for masked in (False, True):
+        reader = pycolmap.ImageReaderOptions()
+        if masked:
+            reader.mask_path = work.masks
+        names = [copy.work_name for copy in copies if copy.masked == masked]
+        for batch in _batches(work, names):
+            progress("finding features", done, len(copies))
+            pycolmap.extract_features(
+                work.database,
+                work.images,
+                batch,
+                pycolmap.CameraMode.PER_IMAGE,
+                reader_options=reader,
+                extraction_options=options,
+            )
+            done += len(batch)
+    progress("finding features", done, len(copies))
+
+
+def _batches(work: Workplace, names: Sequence[str]) -> Iterator[list[str]]:
+    """Copies that COLMAP may decode at the same time: its threads keep whole pictures."""
+    batch: list[str] = []
+    pixels = 0
+    for name in names:
+        with open_image(work.images / name, sys.maxsize) as image:
+            own = image.width * image.height
+        if batch and (len(batch) == EXTRACTION_BATCH or pixels + own > DECODING_PIXELS):
+            yield batch
+            batch, pixels = [], 0
+        batch.append(name)
+        pixels += own
+    if batch:
+        yield batch
+
+
+def describe_photos(work: Workplace, copies: Sequence[WorkingCopy], seed: int) -> Float[Tensor, "N D"]:
+    """A unit vector a photo, by which it is retrieved."""
+    with closing(pycolmap.Database.open(work.database)) as database:
+        ids = image_ids(database, copies)
+
+        def descriptors(photo: int) -> np.ndarray:
+            image_id = ids[photo]
+            if image_id is None or not database.exists_descriptors(image_id):
+                return np.zeros((0, 128), dtype=np.uint8)
+            return database.read_descriptors(image_id).data
+
+        return vlad_descriptors(len(copies), descriptors, seed)
+
+
+def match(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    config: SfmConfig,
+    progress: Progress,
+) -> tuple[Pairing, dict[int, int]]:
+    """Choose the pairs, match their features and verify the matches by epipolar geometry.
+
+    The photos most alike are matched first: copies and crops of one photo are matched with it alone from then on.
+
+    Returns:
+        The pairs that were matched, and from copies and crops to the photo that they were made from.
+    """
+    progress("choosing pairs", 0, 0)
+    likeness = vlads @ vlads.T
+    nearest = alike_pairs(vlads, dict.fromkeys(range(len(copies)), 1))
+    twins = {(a, b) for a, b in nearest if likeness[a, b] > CANDIDATE_LIKENESS}
+    match_pairs(work, copies, twins, config, lambda done, total: progress("matching copies", done, total))
+    crops = find_crops(work, copies, twins)
+    kept = [photo for photo in range(len(copies)) if photo not in crops]
+    rows = {photo: row for row, photo in enumerate(kept)}
+    positions = {
+        rows[photo]: position
+        for photo, copy in enumerate(copies)
+        if photo in rows and (position := copy.position) is not None
+    }
+    chosen = choose_pairs(vlads[kept], positions, config.pairing)
+    pairs = {(kept[a], kept[b]) for a, b in chosen.pairs}
+    match_pairs(
+        work, copies, pairs - twins, config, lambda done, total: progress("matching pairs", done, total)
+    )
+    return Pairing(chosen.name, tuple(sorted(pairs | twins))), crops
+
+
+def match_pairs(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    pairs: Collection[Pair],
+    config: SfmConfig,
+    progress: Callable[[int, int], None],
+    *,
+    tolerant: bool = False,
+) -> None:
+    """Match pairs and verify the matches; what the database holds already is not matched again.
+
+    Args:
+        work: Its database holds the features, and takes the matches.
+        copies: All photos.
+        pairs: Pairs of them.
+        config: Threads and seed.
+        progress: Called with (pairs matched, pairs in all).
+        tolerant: Whether less distinct features are matched, and geometries found among more wrong matches.
+    """
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = config.threads
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
+    if tolerant:
+        options.sift.max_ratio = TOLERANT_RATIO
+        verification.ransac.min_inlier_ratio = TOLERANT_INLIER_RATIO
+    lists = work.root / "pairs.txt"
+    # Pairs of the same two blocks of photos go together, so that features are read once per block.
+    ordered = sorted(pairs, key=lambda pair: (pair[0] // MATCHING_BLOCK, pair[1] // MATCHING_BLOCK, pair))
+    step = max(50, min(MATCHING_BLOCK**2, len(ordered) // 20))
+    for start in range(0, len(ordered), step):
+        progress(start, len(ordered))
+        chunk = ordered[start : start + step]
+        lists.write_text("".join(f"{copies[a].work_name} {copies[b].work_name}\n" for a, b in chunk))
+        pycolmap.match_image_pairs(
+            work.database,
+            matching_options=options,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(lists)),
+            verification_options=verification,
+        )
+    if ordered:
+        progress(len(ordered), len(ordered))
+
+
+def forget_pairs(work: Workplace, copies: Sequence[WorkingCopy], pairs: Collection[Pair]) -> None:
+    """Removes the matches of pairs, so that they can be matched again."""
+    with closing(pycolmap.Database.open(work.database)) as database:
+        ids = image_ids(database, copies)
+        for a, b in pairs:
+            first, second = ids[a], ids[b]
+            if first is not None and second is not None and database.exists_matches(first, second):
+                database.delete_matches(first, second)
+                database.delete_two_view_geometry(first, second)
+
+
+def verified_pairs(database: Any, copies: Sequence[WorkingCopy]) -> dict[Pair, int]:
+    """Matches that agree with the epipolar geometry, by pair of photos."""
+    rows = {image_id: row for row, image_id in enumerate(image_ids(database, copies)) if image_id is not None}
+    found = {}
+    for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+        a, b = (rows[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
+        if inliers:
+            found[min(a, b), max(a, b)] = int(inliers)
+    return found
+
+
+def image_ids(database: Any, copies: Sequence[WorkingCopy]) -> list[int | None]:
+    """The database's ids; None for photos that COLMAP could not read."""
+    ids = {image.name: int(image.image_id) for image in database.read_all_images()}
+    return [ids.get(copy.work_name) for copy in copies]

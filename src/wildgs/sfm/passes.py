@@ -1,0 +1,181 @@
+"""The passes of structure from motion: first the common case, then more for the photos that it leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import pycolmap
+from jaxtyping import Float
+from torch import Tensor
+
+from wildgs.progress import Progress, counter
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.lenses import drop_impossible
+from wildgs.sfm.lookalikes import find_doubtful
+from wildgs.sfm.mapping import (
+    LEAST_GROUP,
+    continue_mapping,
+    map_photos,
+    missing_from,
+)
+from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
+from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, friends_of_friends
+from wildgs.sfm.placement import Findings, PassName
+from wildgs.sfm.point_matching import match_to_points
+from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.workplace import Workplace
+
+ENOUGH_MATCHES = 60
+"""Pairs with so many are not matched again."""
+
+POINT_ROUNDS = 3
+"""Photos that were placed by matches to points bring points for others: so many times."""
+
+LEAST_POINTS = 10
+"""Sparse points of a photo that a second chance placed."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Result of all passes.
+
+    Attributes:
+        models: All models, the kept one first.
+        pairing: Pairs that were matched.
+        passes: The pass that placed a photo, by name of its working copy, where it was not the first.
+        findings: What else was found out about photos.
+    """
+
+    models: list[Any]
+    pairing: Pairing
+    passes: dict[str, PassName]
+    findings: Findings
+
+
+def find_poses(
+    work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress
+) -> Poses | None:
+    """Features, matches and poses of the working copies; None where no two photos match.
+
+    What an interrupted call has done is taken from the workplace: features and matches from the database, and the
+    models of the first pass.
+    """
+    extract(work, copies, config, progress)
+    progress("choosing pairs", 0, 0)
+    vlads = describe_photos(work, copies, config.seed)
+    pairing, crops = match(work, copies, vlads, config, progress)
+    models = work.load_models("first")
+    if models is None:
+        models = map_photos(work, len(copies), config, progress)
+        work.save_models("first", models)
+    passes: dict[str, PassName] = {}
+    if config.second_chance:
+        models, more = _try_again(work, copies, vlads, models, crops, passes, config, progress)
+        pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
+    if not models:
+        return None
+    return Poses(models, pairing, passes, Findings(crops, drop_impossible(models[0])))
+
+
+def _try_again(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    models: list[Any],
+    crops: Mapping[int, int],
+    passes: dict[str, PassName],
+    config: SfmConfig,
+    progress: Progress,
+) -> tuple[list[Any], set[Pair]]:
+    """The second and third pass.
+
+    Returns:
+        All models, and the pairs that were matched again; `passes` notes which photos were placed.
+    """
+    if models:
+        models = _place_by_points(work, copies, vlads, models, passes, "second", config, progress)
+        if not missing_from(models[0], copies):
+            return models[:1], set()
+    more = _more_pairs(work, copies, vlads, models, crops, config)
+    if not work.is_done("more matches"):
+        forget_pairs(work, copies, more)
+        match_pairs(work, copies, more, config, counter(progress, "matching again"), tolerant=True)
+        work.set_done("more matches")
+    if not models:
+        return map_photos(work, len(copies), config, progress), more
+    main = continue_mapping(work, models[0], len(copies), config, progress)
+    _note_new(models[0], main, passes, "third")
+    models = _place_by_points(work, copies, vlads, [main], passes, "third", config, progress)
+    drop_unsure(models[0], work, passes)
+    rest = [copies[photo].work_name for photo in missing_from(models[0], copies)]
+    if len(rest) >= LEAST_GROUP:
+        models = [models[0], *map_photos(work, len(copies), config, progress, only=rest)]
+    return models, more
+
+
+def _place_by_points(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    models: list[Any],
+    passes: dict[str, PassName],
+    name: PassName,
+    config: SfmConfig,
+    progress: Progress,
+) -> list[Any]:
+    """The models, the first with the photos that matches to its points place; these bring points for others."""
+    main = models[0]
+    show = counter(progress, "matching to points")
+    for _ in range(POINT_ROUNDS):
+        if not match_to_points(work, copies, vlads, main, config.seed, show):
+            break
+        before, main = main, continue_mapping(work, main, len(copies), config, progress)
+        _note_new(before, main, passes, name)
+        if main.num_reg_images() == before.num_reg_images():
+            break
+    return [main, *models[1:]]
+
+
+def _more_pairs(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    models: Sequence[Any],
+    crops: Mapping[int, int],
+    config: SfmConfig,
+) -> set[Pair]:
+    """Partners for the photos without a pose, by looks and by common partners, that do not match well already."""
+    kept = [photo for photo in range(len(copies)) if photo not in crops]
+    missing = set(missing_from(models[0], copies)) if models else set(kept)
+    with closing(pycolmap.Database.open(work.database)) as database:
+        matched = verified_pairs(database, copies)
+    count = config.pairing.neighbours
+    wanted = {row: count for row, photo in enumerate(kept) if photo in missing}
+    alike = {(kept[a], kept[b]) for a, b in alike_pairs(vlads[kept], wanted)}
+    friends = friends_of_friends(missing - set(crops), matched, count)
+    return {
+        pair
+        for pair in alike | friends
+        if not set(pair) & set(crops) and matched.get(pair, 0) < ENOUGH_MATCHES
+    }
+
+
+def _names(model: Any) -> set[str]:
+    return {model.image(image_id).name for image_id in model.reg_image_ids()}
+
+
+def _note_new(before: Any, after: Any, passes: dict[str, PassName], name: PassName) -> None:
+    for new in _names(after) - _names(before):
+        passes.setdefault(new, name)
+
+
+def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> None:
+    """Takes photos out that a second chance placed on few points, or against most of their matches."""
+    doubtful = find_doubtful(model, work.database, {name: name for name in _names(model)})
+    for image_id in list(model.reg_image_ids()):
+        image = model.image(image_id)
+        if image.name in passes and (image.name in doubtful or image.num_points3D < LEAST_POINTS):
+            model.deregister_frame(image.frame_id)

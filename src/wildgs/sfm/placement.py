@@ -1,0 +1,145 @@
+"""How each photo was placed, and why the others were not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import pycolmap
+
+from wildgs.sfm.mapping import find_registered
+from wildgs.sfm.matching import image_ids, verified_pairs
+from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.workplace import Workplace
+
+PassName = Literal["first", "second", "third"]
+
+NEIGHBOUR_POINTS = 15
+"""Points that a neighbour shares with a photo, at least."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How sure the pose of a photo is.
+
+    Attributes:
+        placed_by: The first pass; the second, with matches to points; or the third, with more partners and fewer
+            inliers.
+        points: Sparse points that the photo observes.
+        reprojection_error: Their mean error, pixels.
+        neighbours: Photos that share 15 points or more with it.
+    """
+
+    placed_by: PassName
+    points: int
+    reprojection_error: float
+    neighbours: int
+
+
+def placements(
+    model: Any, copies: Sequence[WorkingCopy], passes: Mapping[str, PassName]
+) -> dict[str, Placement]:
+    """How each photo of a model was placed, by name in the scene; `passes` by name of the working copy."""
+    result = {}
+    for copy in copies:
+        image = find_registered(model, copy)
+        if image is None:
+            continue
+        shared: Counter[int] = Counter()
+        errors = []
+        for observation in image.get_observation_points2D():
+            point = model.point3D(observation.point3D_id)
+            projected = image.project_point(point.xyz)
+            if projected is not None:
+                errors.append(float(np.linalg.norm(projected - observation.xy)))
+            shared.update({element.image_id for element in point.track.elements})
+        neighbours = sum(
+            count >= NEIGHBOUR_POINTS for other, count in shared.items() if other != image.image_id
+        )
+        error = float(np.mean(errors)) if errors else 0.0
+        result[copy.scene_name] = Placement(
+            passes.get(copy.work_name, "first"), image.num_points3D, round(error, 3), neighbours
+        )
+    return result
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a photo has no pose.
+
+    Attributes:
+        reason: For people.
+        partner: The photo with which it has the most matches, where there is one.
+    """
+
+    reason: str
+    partner: str | None = None
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the steps of mapping found out about photos.
+
+    Attributes:
+        crops: From copies and crops to their original, as indices of photos.
+        lenses: From working names to what is wrong with the lens.
+    """
+
+    crops: Mapping[int, int] = field(default_factory=dict)
+    lenses: Mapping[str, str] = field(default_factory=dict)
+
+
+def failures(
+    work: Workplace, copies: Sequence[WorkingCopy], models: Sequence[Any], findings: Findings
+) -> dict[str, Failure]:
+    """Why the photos without a pose in the kept model, the first, have none; by their names."""
+    with closing(pycolmap.Database.open(work.database)) as database:
+        ids = image_ids(database, copies)
+        found = verified_pairs(database, copies)
+        blank = {row for row, i in enumerate(ids) if i is None or database.num_keypoints_for_image(i) == 0}
+    best: dict[int, tuple[int, int]] = {}
+    for (a, b), inliers in found.items():
+        best[a] = max(best.get(a, (0, 0)), (inliers, b))
+        best[b] = max(best.get(b, (0, 0)), (inliers, a))
+    result = {}
+    for row, copy in enumerate(copies):
+        if find_registered(models[0], copy) is not None:
+            continue
+        inliers, partner = best.get(row, (0, row))
+        reason = _reason(row, copies, models, findings, blank, inliers, partner)
+        result[copy.name] = Failure(reason, copies[partner].name if inliers else None)
+    return result
+
+
+def _reason(
+    row: int,
+    copies: Sequence[WorkingCopy],
+    models: Sequence[Any],
+    findings: Findings,
+    blank: set[int],
+    inliers: int,
+    partner: int,
+) -> str:
+    copy = copies[row]
+    if row in blank:
+        return "no features found (blank, blurred or very small)"
+    if copy.work_name in findings.lenses:
+        return findings.lenses[copy.work_name]
+    other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
+    if other is not None:
+        members = [c.name for c in copies if c is not copy and find_registered(other, c) is not None]
+        return (
+            f"belongs to a separate group of {other.num_reg_images()} photos (with {', '.join(members[:3])}), which"
+            " too little connects with the others: photos from between would"
+        )
+    if row in findings.crops:
+        return f"a copy or crop of {copies[findings.crops[row]].name}, which has no pose"
+    if inliers == 0:
+        return "matches no other photo"
+    if find_registered(models[0], copies[partner]) is None:
+        return f"its best partner, {copies[partner].name} ({inliers} matches), has no pose either"
+    return f"too few matches agree with the scene ({inliers} at best, with {copies[partner].name})"

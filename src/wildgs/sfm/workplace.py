@@ -1,0 +1,152 @@
+"""Where structure from motion works: folders and a database beside the output, which survive a kill."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import filelock
+import pycolmap
+
+from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import is_file, written_aside
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.upright import WorkingCopy, list_photos
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Working folders and files of one reconstruction."""
+
+    root: Path
+
+    @property
+    def images(self) -> Path:
+        """The upright copies."""
+        return self.root / "images"
+
+    @property
+    def masks(self) -> Path:
+        """Masks of transparent pixels, by copy; absent where no photo has any."""
+        return self.root / "masks"
+
+    @property
+    def database(self) -> Path:
+        """Features and matches."""
+        return self.root / "database.db"
+
+    @property
+    def scene(self) -> Path:
+        """The finished scene before it moves to its place."""
+        return self.root / "scene"
+
+    def fresh(self, name: str) -> Path:
+        """An empty sub-folder."""
+        folder = self.root / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        return folder
+
+    def save_copies(self, copies: list[WorkingCopy], broken: dict[str, str]) -> None:
+        """Records that all photos have been copied."""
+        record = {"copies": [asdict(copy) for copy in copies], "broken": broken}
+        with written_aside(self.root / "copies.json") as aside:
+            aside.write_text(json.dumps(record), encoding="utf-8")
+
+    def load_copies(self) -> tuple[list[WorkingCopy], dict[str, str]] | None:
+        """The copies of an interrupted reconstruction, None where they are not complete."""
+        try:
+            record = json.loads((self.root / "copies.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        copies = [
+            WorkingCopy(**{**copy, "position": copy["position"] and tuple(copy["position"])})
+            for copy in record["copies"]
+        ]
+        return copies, record["broken"]
+
+    def is_done(self, stage: str) -> bool:
+        """Whether a stage was finished, by this call or an interrupted one."""
+        return (self.root / f"{stage}.done").is_file()
+
+    def set_done(self, stage: str) -> None:
+        """Records that a stage was finished."""
+        (self.root / f"{stage}.done").touch()
+
+    def save_models(self, name: str, models: list[pycolmap.Reconstruction]) -> None:
+        """Keeps the result of a stage of mapping."""
+        aside = self.fresh(f"{name}.part")
+        for number, model in enumerate(models):
+            (aside / str(number)).mkdir()
+            model.write(aside / str(number))
+        shutil.rmtree(self.root / name, ignore_errors=True)
+        aside.rename(self.root / name)
+
+    def load_models(self, name: str) -> list[pycolmap.Reconstruction] | None:
+        """The result of a stage of mapping that an interrupted reconstruction finished."""
+        folder = self.root / name
+        if not folder.is_dir():
+            return None
+        return [pycolmap.Reconstruction(folder / str(n)) for n in range(len(list(folder.iterdir())))]
+
+
+def work_folder(output: Path) -> Path:
+    """Where the work of an output lies while it goes on, and after it was interrupted."""
+    return output.parent / f".wildgs-sfm-{output.name}"
+
+
+@contextmanager
+def open_workplace(photos: Path, output: Path, config: SfmConfig) -> Iterator[Workplace]:
+    """The workplace of an output; the one that was left there if it began with the same photos and options.
+
+    It is removed when the block ends well or with a `UserError`, and kept when the work was interrupted.
+
+    Raises:
+        UserError: Another process works on the same output.
+    """
+    folder = work_folder(output)
+    lock = filelock.FileLock(output.parent / f"{folder.name}.lock", timeout=0)
+    try:
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise UserError(
+            f"{output}: another process finds poses for it; wait for it, or give another folder"
+        ) from error
+    try:
+        plan = _plan(photos, config)
+        if not folder.is_dir() or _read(folder / "plan") != plan:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            (folder / "plan").write_text(plan, encoding="utf-8")
+        try:
+            yield Workplace(folder)
+        except UserError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        except KeyboardInterrupt:
+            message = f"what was done is kept in {folder}; the same command continues, or delete that folder"
+            warnings.warn(message, WildGSWarning, stacklevel=3)
+            raise
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        lock.release()
+        Path(lock.lock_file).unlink(missing_ok=True)
+
+
+def _read(file: Path) -> str | None:
+    return file.read_text(encoding="utf-8") if is_file(file) else None
+
+
+def _plan(photos: Path, config: SfmConfig) -> str:
+    """What the work depends on: options, pycolmap, and name, size and time of every photo."""
+    digest = hashlib.sha256(f"{pycolmap.__version__} {config}".encode())
+    for name in list_photos(photos):
+        stat = (photos / name).stat()
+        digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\0".encode(errors="surrogateescape"))
+    return digest.hexdigest()

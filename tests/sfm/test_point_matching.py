@@ -1,0 +1,75 @@
+"""Matches to points, on the photos of a corner: a photo whose matches to photos were lost gets its pose back."""
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from wildgs.progress import silent
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.mapping import continue_mapping, map_photos, missing_from
+from wildgs.sfm.match_pictures import SIDE, draw_matches, write_match_pictures
+from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, verified_pairs
+from wildgs.sfm.placement import Findings, failures
+from wildgs.sfm.point_matching import match_to_points
+from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.workplace import Workplace
+
+LOST = 5
+
+
+@pytest.fixture(scope="module")
+def matched(corner, tmp_path_factory: pytest.TempPathFactory) -> tuple[Workplace, list[WorkingCopy]]:
+    work = Workplace(tmp_path_factory.mktemp("work"))
+    work.images.mkdir()
+    copies = []
+    for number, pixels in enumerate(corner[0]):
+        copies.append(WorkingCopy(f"{number}.jpg", f"{number:06d}.jpg", f"{number}.jpg", False))
+        Image.fromarray(pixels).save(work.images / copies[-1].work_name, quality=95)
+    extract(work, copies, SfmConfig(), silent)
+    match(work, copies, describe_photos(work, copies, 0), SfmConfig(), silent)
+    forget_pairs(work, copies, [(other, LOST) for other in range(LOST) if other != 2])
+    return work, copies
+
+
+def test_a_photo_finds_its_pose_by_points(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
+    work, copies = matched
+    config = SfmConfig()
+    model = map_photos(work, len(copies), config, silent, only=[copy.work_name for copy in copies[:LOST]])[0]
+    assert missing_from(model, copies) == [LOST]
+    with pycolmap.Database.open(work.database) as database:
+        before = verified_pairs(database, copies)
+    assert (0, LOST) not in before
+    vlads = describe_photos(work, copies, 0)
+    assert match_to_points(work, copies, vlads, model, 0, lambda done, total: None) == [
+        copies[LOST].work_name
+    ]
+    with pycolmap.Database.open(work.database) as database:
+        after = verified_pairs(database, copies)
+    assert after[0, LOST] >= 15
+    assert after[2, LOST] >= before[2, LOST]  # what pairs of photos found stays
+    assert missing_from(continue_mapping(work, model, len(copies), config, silent), copies) == []
+
+
+def test_photos_left_out_are_drawn_beside_their_partner(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
+    work, copies = matched
+    model = map_photos(
+        work, len(copies), SfmConfig(), silent, only=[copy.work_name for copy in copies[:LOST]]
+    )[0]
+    without = failures(work, copies, [model], Findings())
+    assert list(without) == [f"{LOST}.jpg"]
+    assert without[f"{LOST}.jpg"].partner in {copy.name for copy in copies[:LOST]}
+    work.fresh("scene")
+    pictures = write_match_pictures(work, copies, without)
+    with Image.open(work.scene / pictures[f"{LOST}.jpg"]) as picture:
+        assert picture.width == 2 * SIDE
+
+
+def test_lines_end_where_the_matches_are() -> None:
+    photos = [Image.new("RGB", (640, 320)), Image.new("RGB", (160, 320))]
+    picture = np.asarray(draw_matches(photos, [np.array([[100.0, 200.0]]), np.array([[80.0, 40.0]])]))
+    assert picture.shape == (320, 320 + 160, 3)
+    ys, xs = np.nonzero(picture[:160].sum(axis=2))
+    drawn = np.flatnonzero(xs < 480)
+    assert (xs[drawn].min(), ys[drawn].max()) == (50, 100)
+    assert (xs[drawn].max(), ys[drawn].min()) == (400, 40)
