@@ -12,7 +12,7 @@ from wildgs.scene.config import MAX_IMAGE_PIXELS
 class PairingConfig:
     """When and how partners are chosen."""
 
-    exhaustive_limit: int = 40
+    exhaustive_limit: int = 60
     """Sets of up to this many photos are matched all with all."""
     neighbours: int = 16
     """Partners per photo in larger sets."""

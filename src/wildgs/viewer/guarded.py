@@ -61,7 +61,7 @@ class GuardedServer(viser.ViserServer):
         if not taken:
             self.stop()
             raise UserError(
-                f"viser {viser.__version__} cannot be protected: its server differs from that of supported versions; "
+                f"viser {viser.__version__} is not supported, because its server cannot be protected: "
                 "pip install 'viser>=1.1,<1.2'"
             )
 
