@@ -34,7 +34,7 @@ class SfmConfig:
     """Features per photo."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
     """Photos with more pixels are left out."""
-    affine_features: bool = True
+    affine_features: bool = False
     """Whether features have an affine shape, which survives oblique views; finding them takes 1.4 times as long."""
     second_chance: bool = True
     """Whether photos without a pose are matched to points, and with more partners, and tried again."""
