@@ -156,6 +156,9 @@ def test_without_a_suite_ablations_are_those_of_the_default():
         method_config("without-crop", BASE)
     assert {"paper", "wildgs"} <= set(default_bench_methods(None))
     assert "default" not in default_bench_methods(None)
+    for name in default_bench_methods(None):
+        method_config(name, BASE)
+    assert "without-crop" in default_bench_methods("phototourism")
 
 
 def test_preset_finds_its_scenes_in_the_papers_order(tmp_path):

@@ -21,7 +21,9 @@ from wildgs.sfm.report import describe_placed, read_left_out
 from wildgs.sfm.workplace import Workplace
 
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
-EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3))
+# Affine shape finds more matches in photos as small as these.
+AFFINE = SfmConfig(affine_features=True)
+EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3), affine_features=True)
 
 
 def save_photos(folder: Path, photos: list[np.ndarray], **exif: Image.Exif) -> Path:
@@ -72,7 +74,7 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
         pytest.warns(WildGSWarning, match=r"broken\.jpg: .*left out"),
         pytest.warns(WildGSWarning, match=r"not used: notes\.txt"),
     ):
-        report = reconstruct(folder, tmp_path / "scene", progress=lambda *step: steps.append(step))
+        report = reconstruct(folder, tmp_path / "scene", AFFINE, progress=lambda *step: steps.append(step))
 
     names = [
         "crop.jpg",

@@ -22,9 +22,7 @@ class Command:
     floats in units of the COLMAP model) where three of them agree. Training uses both where both exist. Photos that
     already have an estimate are skipped.
 
-    Examples:
-        wildgs depth scenes/gate
-        wildgs depth scenes/gate --by stereo
+    Example: wildgs depth scenes/gate --by stereo
     """
 
     scene: tyro.conf.Positional[Path]

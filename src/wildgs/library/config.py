@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from wildgs.model.config import Ablation
+from wildgs.model.config import WRAPPING_PARTS, Ablation
 from wildgs.model.registry import DEFAULT_METHOD, METHODS
 from wildgs.presets import PRESET_NAMES, PresetName
 
@@ -36,8 +36,12 @@ def reference_preset(suite: Suite | None) -> PresetName:
 
 
 def default_bench_methods(suite: Suite | None) -> tuple[str, ...]:
-    """All of `BENCH_METHODS` but the preset that `wildgs` stands for already."""
-    return tuple(name for name in BENCH_METHODS if name != reference_preset(suite))
+    """All of `BENCH_METHODS` but the preset that `wildgs` stands for already, and what it has nothing of.
+
+    The default has no 3D Wrapping, of which parts could be left out.
+    """
+    absent = [WITHOUT + part for part in WRAPPING_PARTS] if suite is None else []
+    return tuple(name for name in BENCH_METHODS if name not in (reference_preset(suite), *absent))
 
 
 @dataclass(frozen=True)

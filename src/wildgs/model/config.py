@@ -17,6 +17,8 @@ Ablation = Literal["crop", "reverse", "global", "mask", "depth", "intrinsic", "l
 """Parts that can be left out: the paper's five ablations, and the intrinsic and local features."""
 
 
+WRAPPING_PARTS: tuple[Ablation, ...] = ("local", "reverse", "crop")
+"""Ablations of 3D Wrapping."""
 WRAPPING_RANGES = {
     "resolution": (4, 1024),
     "features": (1, 512),
@@ -255,7 +257,7 @@ class WildGSConfig:
 
     def __post_init__(self) -> None:
         """Refuses to leave out what is not there."""
-        absent = [part for part in ("local", "reverse", "crop") if part in self.without]
+        absent = [part for part in WRAPPING_PARTS if part in self.without]
         if absent and not self.local_embeddings:
             raise UserError(
                 f"without {', '.join(absent)}: that is a part of 3D Wrapping, which is off; "
