@@ -183,24 +183,22 @@ def _fitted(
 
     Nothing in it waits for a GPU: pixels that do not count are weighted, not selected.
     """
-    precision = torch.float32 if training else torch.float64
     counts = (weights > 0).reshape(-1)
-    base = torch.where(counts, weights.reshape(-1), 0).to(precision)
-    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(max=1), 0).to(precision)
-    residual = torch.where(counts[:, None], photo.reshape(-1, 3), 0).to(precision) - colors
-    further = further.reshape(len(colors), -1).to(precision)
+    base = torch.where(counts, weights.reshape(-1), 0).double()
+    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(max=1), 0).double()
+    residual = torch.where(counts[:, None], photo.reshape(-1, 3), 0).double() - colors
+    further = further.reshape(len(colors), -1).double()
     # A leading axis of problems: one of three channels, or one for each channel.
     if training:
         terms = torch.cat([colors.T[..., None], further.expand(3, -1, -1)], dim=2)
         residual = residual.T[..., None]
     else:
         terms, residual = torch.cat([colors, further], dim=1)[None], residual[None]
-    ridge = RIDGE * torch.eye(terms.shape[2], dtype=torch.float64, device=terms.device)
+    ridge = RIDGE * torch.eye(terms.shape[2], dtype=terms.dtype, device=terms.device)
     change, trusted = terms.new_zeros(()), base
     for _ in range(TRAINING_ROUNDS if training else ROUNDS):
         weighted = terms.mT * (trusted / trusted.sum())
-        left, right = (weighted @ terms).double() + ridge, (weighted @ residual).double()
-        change = torch.linalg.solve_ex(left, right).result.to(precision)
+        change = torch.linalg.solve_ex(weighted @ terms + ridge, weighted @ residual).result
         error = (residual - terms @ change).abs().mean(dim=(0, 2))
         trusted = base * OUTLIER**2 / (OUTLIER**2 + error.square())
     found = torch.cat([change[:, 0, 0].diag(), change[:, 1:, 0]], dim=1) if training else change[0].T
