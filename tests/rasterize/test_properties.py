@@ -145,7 +145,7 @@ def test_a_sample_of_the_tiles_shows_what_the_whole_shows(background: Tensor | N
     whole = blend(projection, values, background=background)
     written = torch.zeros(100, 150, dtype=torch.bool)
     for _ in range(12):  # tiles are drawn anew each time
-        part = blend(projection, values, background=background, tile_step=3)
+        part = blend(projection, values, background=background, sample_tiles=20)
         there = part.colors.any(dim=-1)
         assert 0.2 < there.float().mean() / (whole.colors.any(dim=-1)).float().mean() < 0.5
         for seen, truth in zip(vars(part).values(), vars(whole).values(), strict=True):

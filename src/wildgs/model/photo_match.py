@@ -25,12 +25,10 @@ from wildgs.model.gaussians import Gaussians
 from wildgs.model.sky import Sky, find_sky
 from wildgs.rasterize import Projection, Rendering, blend
 
-TILE = 16
-"""Pixels along a side of what the rasteriser leaves out of a sample."""
 MATCH_EVERY = 3
 """Rows and columns of which one is read in training, where there are as many."""
 MATCH_TILES = 40
-"""Tiles of a training picture that are rendered for its match, at least, where there are as many."""
+"""Tiles of a training picture that are rendered for its match."""
 FIT_SIDE = 320
 """Pixels along the long side, at most, at which an encoded photo is matched: light is of low frequency."""
 
@@ -143,15 +141,12 @@ class PhotoMatch(nn.Module):
             centre: Of the scene.
             training: Whether a sample is enough: of the tiles, and of their rows and columns.
         """
-        camera = projection.camera
-        tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-        step = max(1, tiles // MATCH_TILES) if training else 1
-        blended = blend(projection, values, tile_step=step)
+        blended = blend(projection, values, sample_tiles=MATCH_TILES if training else None)
         every = MATCH_EVERY if training else 1
         rows, columns = (slice(min(every // 2, side - 1), None, every) for side in blended.alpha.shape)
         pixels = (rows, columns)
         colors, depth = blended.colors[pixels], blended.depth[pixels]
-        sky = self.sky(camera.unproject(depth, pixels), centre)
+        sky = self.sky(projection.camera.unproject(depth, pixels), centre)
         return Picture(Rendering(colors[..., :3], depth, blended.alpha[pixels]), colors[..., 3:], sky, pixels)
 
     def find(self, sight: Sight, picture: Picture, *, training: bool = False) -> Float[Tensor, "3 M"]:

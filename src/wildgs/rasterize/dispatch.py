@@ -102,7 +102,7 @@ def blend(
     *,
     background: Float[Tensor, "C"] | None = None,
     depth: bool = True,
-    tile_step: int = 1,
+    sample_tiles: int | None = None,
 ) -> Rendering:
     """Blends values per Gaussian front to back over a projection's tile lists.
 
@@ -114,8 +114,8 @@ def blend(
         colors: Any number of channels per Gaussian; None for depth and alpha alone.
         background: Colour behind everything; black if None.
         depth: Whether to blend expected depth too.
-        tile_step: Blend one tile in so many, at random and without gradient, where the backend can: a sample of the
-            picture for what needs no more. Elsewhere alpha is 0 then. Others blend all.
+        sample_tiles: Blend about so many tiles, drawn at random and spread over the picture, without gradient:
+            enough for statistics of the picture. Alpha is 0 in the others. Backends that cannot blend all.
 
     Raises:
         ValueError: Shapes, devices or number types do not fit.
@@ -126,10 +126,10 @@ def blend(
     _check("colors", colors, (len(means2d), None), means2d, projection.backend)
     if background is not None:
         _check("background", background, (colors.shape[1],), means2d, projection.backend)
-    if tile_step > 1 and projection.backend == "cpu":
+    if sample_tiles is not None and projection.backend == "cpu":
         from wildgs.rasterize.cpu import blend_sample
 
-        return blend_sample(projection, colors, background, depth, tile_step)
+        return blend_sample(projection, colors, background, depth, sample_tiles)
     return _module(projection.backend).blend(projection, colors, background, depth)
 
 

@@ -136,13 +136,14 @@ def blend_sample(
     colors: Float[Tensor, "N C"],
     background: Float[Tensor, "C"] | None,
     depth: bool,
-    step: int,
+    count: int,
 ) -> Rendering:
-    """Blends a random one of every `step` tiles, spread over the picture; alpha is 0 in the others."""
+    """Blends about `count` tiles, drawn at random and spread over the picture; alpha is 0 in the others."""
     if background is None:
         background = colors.new_zeros(colors.shape[1])
     order: np.ndarray = projection.tiles.tile_order
     columns = -(-projection.camera.width // TILE)
+    step = max(1, len(order) // count)
     # Diagonals of tiles, which no row or column of the picture escapes.
     diagonal = order // columns + order % columns + int(torch.randint(step, ()))
     chosen = order[diagonal % step == 0]
