@@ -126,10 +126,13 @@ def blend(
     _check("colors", colors, (len(means2d), None), means2d, projection.backend)
     if background is not None:
         _check("background", background, (colors.shape[1],), means2d, projection.backend)
-    if sample_tiles is not None and projection.backend == "cpu":
-        from wildgs.rasterize.cpu import blend_sample
+    if sample_tiles is not None:
+        # Drawn for every backend, so that all of them leave the random state of a training the same.
+        place = float(torch.rand(()))
+        if projection.backend == "cpu":
+            from wildgs.rasterize.cpu import blend_sample
 
-        return blend_sample(projection, colors, background, depth, sample_tiles)
+            return blend_sample(projection, colors, background, depth, sample_tiles, place)
     return _module(projection.backend).blend(projection, colors, background, depth)
 
 

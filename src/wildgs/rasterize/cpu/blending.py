@@ -137,14 +137,15 @@ def blend_sample(
     background: Float[Tensor, "C"] | None,
     depth: bool,
     count: int,
+    place: float,
 ) -> Rendering:
-    """Blends about `count` tiles, drawn at random and spread over the picture; alpha is 0 in the others."""
+    """Blends about `count` tiles spread over the picture, chosen by `place` in [0, 1); alpha is 0 in the others."""
     if background is None:
         background = colors.new_zeros(colors.shape[1])
     order: np.ndarray = projection.tiles.tile_order
     columns = -(-projection.camera.width // TILE)
     step = max(1, len(order) // count)
     # Diagonals of tiles, which no row or column of the picture escapes.
-    diagonal = order // columns + order % columns + int(torch.randint(step, ()))
+    diagonal = order // columns + order % columns + int(place * step)
     chosen = order[diagonal % step == 0]
     return Rendering(*_blend_pictures(projection, colors, background, depth, False, chosen)[:3])
