@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 
+from wildgs.errors import UserError
 from wildgs.exporters.splats import CleanupConfig, Splats, agreement, clean, kept_rows
 from wildgs.geometry.camera import Camera
 
@@ -43,6 +45,16 @@ def test_the_crop_keeps_the_points_box(splats: Splats) -> None:
     assert torch.equal(keep, (splats.means.abs() <= 1).all(dim=1))
     wide = kept_rows(CleanupConfig(crop=2.0), splats, thick)
     assert torch.equal(wide, (splats.means.abs() <= 2).all(dim=1))
+
+
+def test_the_sky_can_be_left_out_where_it_is_known(splats: Splats) -> None:
+    sky = torch.arange(len(splats)) % 3 == 0
+    below = clean(CleanupConfig(drop_sky=True), replace(splats, sky=sky), POINTS, NOWHERE)
+    assert torch.equal(below.means, splats.means[~sky])
+    assert below.sky is not None
+    assert not below.sky.any()
+    with pytest.raises(UserError, match="--drop-sky"):
+        clean(CleanupConfig(drop_sky=True), splats, POINTS, NOWHERE)
 
 
 def test_harmonics_are_cut_to_the_degree(splats: Splats) -> None:

@@ -15,6 +15,7 @@ class CleanupConfig:
             of the photos is 1); None keeps all.
         crop: Gaussians outside the bounding box of nearly all SfM points, scaled by this factor, are dropped; None
             keeps all.
+        drop_sky: The Gaussians that stand for the sky are dropped.
         sh_degree: Spherical harmonics are truncated to this degree, fitted to the viewing directions of the photos;
             None keeps all.
         own_harmonics: Of files with several lights: share of the Gaussians that keep their own harmonics above
@@ -24,6 +25,7 @@ class CleanupConfig:
     min_opacity: float = 0.0
     max_distance: float | None = None
     crop: float | None = None
+    drop_sky: bool = False
     sh_degree: int | None = None
     own_harmonics: float = 0.09
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from wildgs.errors import UserError
 from wildgs.exporters.config import CleanupConfig
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import (
@@ -35,6 +36,7 @@ class Splats:
         scales: Standard deviations along the principal axes, world units, linear.
         opacities: Opacities in [0, 1], linear.
         sh: Spherical harmonics, 1, 4, 9 or 16 coefficients per channel.
+        sky: Which of them stand for the sky; None where the method does not tell.
     """
 
     means: Float[Tensor, "N 3"]
@@ -42,6 +44,7 @@ class Splats:
     scales: Float[Tensor, "N 3"]
     opacities: Float[Tensor, " N"]
     sh: Float[Tensor, "N K 3"]
+    sky: Bool[Tensor, " N"] | None = None
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -53,9 +56,8 @@ class Splats:
 
     def select(self, keep: Bool[Tensor, " N"]) -> Splats:
         """The Gaussians that are True in `keep`."""
-        return Splats(
-            self.means[keep], self.quats[keep], self.scales[keep], self.opacities[keep], self.sh[keep]
-        )
+        present = {name: value for name, value in vars(self).items() if value is not None}
+        return Splats(**{name: value[keep] for name, value in present.items()})
 
     def with_sh(self, sh: Float[Tensor, "N K 3"]) -> Splats:
         """The same Gaussians with other spherical harmonics."""
@@ -76,11 +78,10 @@ class Splats:
         turned = (turn * Rotation.from_quat(self.quats.double().cpu().numpy(), scalar_first=True)).as_quat(
             scalar_first=True
         )
-        return Splats(
+        return replace(
+            self,
             means=self.means @ rotation.to(self.means).T,
             quats=torch.from_numpy(turned).to(self.quats),
-            scales=self.scales,
-            opacities=self.opacities,
             sh=rotate_sh(self.sh, rotation),
         )
 
@@ -90,7 +91,11 @@ BOX_QUANTILE = 0.02
 
 
 def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:
-    """Mask of the Gaussians (aligned frame) that are kept; `points` are the SfM points in the same frame."""
+    """Mask of the Gaussians (aligned frame) that are kept; `points` are the SfM points in the same frame.
+
+    Raises:
+        UserError: The sky is to go, and nothing tells what it is.
+    """
     keep = splats.opacities >= config.min_opacity
     if config.max_distance is not None:
         middle = points.median(dim=0).values.to(splats.means)
@@ -99,6 +104,10 @@ def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"
         box = robust_box(points, BOX_QUANTILE, config.crop)
         low, high = box.low.to(splats.means), box.high.to(splats.means)
         keep &= ((splats.means >= low) & (splats.means <= high)).all(dim=1)
+    if config.drop_sky:
+        if splats.sky is None:
+            raise UserError("--drop-sky: this run's method does not tell which Gaussians are sky; use --crop")
+        keep &= ~splats.sky
     return keep
 
 

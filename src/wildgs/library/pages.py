@@ -120,7 +120,8 @@ def baked(loaded: LoadedScene, look: Look) -> Splats:
     """The run's Gaussians under a look, in main memory, in the scene's aligned frame."""
     gaussians = loaded.gaussians
     values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, look.sh)
-    return Splats(*(value.detach().cpu().float() for value in values))
+    sky = loaded.run.method.sky()
+    return Splats(*(value.detach().cpu().float() for value in values), None if sky is None else sky.cpu())
 
 
 def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
