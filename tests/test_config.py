@@ -81,13 +81,14 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     """What their `config.yaml` does not name was not there when they began."""
     plain = to_plain(BASE)
     model, train = plain["model"], plain["train"]
-    for name in ("matched_loss", "light_codes", "light_components"):
+    for name in ("matched_loss", "light_codes", "light_components", "eps2d"):
         assert model.pop(name) > 0
     assert model.pop("local_embeddings") is False
     assert model["sky"].pop("densify") is False
     assert train["optimizer"].pop("short_runs") > 0
     config = from_plain(RunConfig, plain)
     assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
+    assert config.model.eps2d == 0.3  # with which its Gaussians were trained
     assert config.model.local_embeddings
     assert config.model.sky.densify
     assert config.train.optimizer.short_runs == 0

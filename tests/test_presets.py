@@ -31,6 +31,7 @@ MENDED = {
     "model.sky.densify": True,
     "model.color_match": False,
     "model.light_codes": 0,
+    "model.eps2d": 0.3,
     "model.light_components": 0,
     "model.matched_loss": 0.0,
     "train.objective.depth_weight": 0.05,

@@ -72,7 +72,7 @@ class StandIn:
         camera = Camera(view.inner[0].clone(), K.inner[0].clone(), width, height)
 
         def compute(*geometry: Tensor) -> tuple[Tensor, ...]:
-            seen = self.projection = project(*geometry, camera, backend="cpu", near=near_plane)
+            seen = self.projection = project(*geometry, camera, backend="cpu", near=near_plane, eps2d=eps2d)
             radii = seen.radii.int()[None, :, None].expand(-1, -1, 2)
             return radii, seen.means2d[None], seen.depths[None], seen.conics[None]
 

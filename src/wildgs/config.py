@@ -208,6 +208,7 @@ _BEFORE: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "light_codes"): ("color_match", 0),
     ("model", "light_components"): ("color_match", 0),
     ("model", "local_embeddings"): ("wrapping", True),
+    ("model", "eps2d"): ("wrapping", 0.3),
     ("model", "sky", "densify"): ("lowest", True),
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
     ("train", "schedule", "mask_every"): ("mask_pause", 1),

@@ -43,6 +43,7 @@ _PAPER: dict[str, Any] = {
     "model.light_codes": 0,
     "model.light_components": 0,
     "model.matched_loss": 0.0,
+    "model.eps2d": 0.3,
     "train.objective.depth_weight": 0.05,
     "train.objective.metric_weight": 0.0,
     "train.schedule.encoder_every": 1,

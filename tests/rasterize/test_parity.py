@@ -23,6 +23,7 @@ class Case:
     opacities: Tensor
     colors: Tensor
     camera: Camera
+    eps2d: float = 0.3
 
     def inputs(self) -> list[Tensor]:
         return [self.means, self.quats, self.scales, self.opacities, self.colors]
@@ -63,7 +64,7 @@ def render(case: Case, backend: str, dtype: torch.dtype) -> tuple[Projection, Re
     inputs = [t.detach().clone().to(device, dtype).requires_grad_() for t in case.inputs()]
     channels = case.colors.shape[1]
     background = torch.linspace(0.2, 0.8, channels).to(device, dtype).detach().requires_grad_()
-    projection = project(*inputs[:4], case.camera.to(device), backend=backend, absgrad=True)
+    projection = project(*inputs[:4], case.camera.to(device), backend=backend, absgrad=True, eps2d=case.eps2d)
     projection.means2d.retain_grad()
     rendering = blend(projection, inputs[4], background=background)
     g = torch.Generator().manual_seed(9)
@@ -124,6 +125,14 @@ def test_any_number_of_channels(backend: str, channels: int):
 @pytest.mark.parametrize("size", [1e-5, 0.3, 3.0, 100.0])
 def test_tiny_to_huge(backend: str, size: float):
     assert_same(random_case(60, 70, 50, size=size), backend, tolerance=5e-4)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("eps2d", [0.03, 2.0])
+def test_more_and_less_of_a_blur(backend: str, eps2d: float):
+    case = random_case(200, 48, 48, size=0.01)
+    case.eps2d = eps2d
+    assert_same(case, backend, tolerance=1e-3)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

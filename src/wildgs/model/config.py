@@ -237,6 +237,8 @@ class WildGSConfig:
             landmark; 0 for none. Not in the paper.
         light_components: Size of the basis of lights in which a photo's light is fitted after the colour match
             (`wildgs.model.light_basis`); 0 for none. Not in the paper.
+        eps2d: Added to the diagonal of the Gaussians' 2D covariances, square pixels. 3DGS has 0.3, which
+            blurs what is as small as a pixel.
         learning_rates: Of networks and intrinsic features.
     """
 
@@ -253,10 +255,13 @@ class WildGSConfig:
     matched_loss: float = 0.8
     light_codes: int = 8
     light_components: int = 32
+    eps2d: float = 0.1
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
     def __post_init__(self) -> None:
-        """Refuses to leave out what is not there."""
+        """Refuses to leave out what is not there, and Gaussians that are all blur or none."""
+        if not 0.01 <= self.eps2d <= 10:
+            raise UserError(f"eps2d {self.eps2d}: must be from 0.01 to 10")
         absent = [part for part in WRAPPING_PARTS if part in self.without]
         if absent and not self.local_embeddings:
             raise UserError(

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
-from wildgs.rasterize import Projection, project
+from wildgs.rasterize import EPS2D, Projection, project
 
 INITIAL_OPACITY = 0.1
 NEAR = 0.05
@@ -35,11 +35,16 @@ class Gaussians(nn.Module):
 
     Stored values are raw: `log_scales` (exp gives world units), `opacity_logits` (sigmoid gives opacity),
     `quats` (w, x, y, z, not normalised).
+
+    Attributes:
+        rows: All parameters.
+        eps2d: With which they are projected; see `wildgs.rasterize.project`.
     """
 
     def __init__(self, rows: dict[str, Tensor]) -> None:
         """Takes the initial values of all rows, `GEOMETRY_ROWS` among them."""
         super().__init__()
+        self.eps2d = EPS2D
         self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})
 
     def __len__(self) -> int:
@@ -70,7 +75,16 @@ class Gaussians(nn.Module):
     ) -> Projection:
         """Projects and bins all Gaussians for one camera; `factors` multiply their opacities, up to 0.999."""
         opacities = self.opacities if factors is None else (self.opacities * factors).clamp(max=0.999)
-        return project(self.means, self.quats, self.scales, opacities, camera, near=NEAR, absgrad=absgrad)
+        return project(
+            self.means,
+            self.quats,
+            self.scales,
+            opacities,
+            camera,
+            near=NEAR,
+            absgrad=absgrad,
+            eps2d=self.eps2d,
+        )
 
 
 def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:

@@ -45,6 +45,7 @@ class WildGS(Method):
         super().__init__()
         self.config = config
         self.gaussians = gaussians
+        gaussians.eps2d = config.eps2d
         self.sh_degree = config.fusion.sh_degree
         self.global_size = config.parsing.global_size
         self.local_size = config.wrapping.local_size

@@ -7,9 +7,10 @@ from wildgs.rasterize.dispatch import (
     rasterize,
     sh_to_colors,
 )
-from wildgs.rasterize.interface import BackendName, Projection, Rendering
+from wildgs.rasterize.interface import EPS2D, BackendName, Projection, Rendering
 
 __all__ = [
+    "EPS2D",
     "BackendName",
     "Projection",
     "Rendering",

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.gsplat_library import load_gsplat
-from wildgs.rasterize.interface import DILATION, Projection, Rendering
+from wildgs.rasterize.interface import Projection, Rendering
 
 TILE = 16
 _LEAST_ALPHA = 1e-10
@@ -52,6 +52,7 @@ def project(
     camera: Camera,
     near: float,
     absgrad: bool,
+    eps2d: float,
 ) -> Projection:
     """See `wildgs.rasterize.project`."""
     gsplat = load_gsplat()
@@ -63,7 +64,7 @@ def project(
     # Packed mode is not used: in gsplat 1.5.3 it reads Gaussian indices of another integer type than it writes.
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
         means, None, quats, scales, view, K, camera.width, camera.height,
-        eps2d=DILATION, near_plane=near, packed=False, opacities=visible_opacities,
+        eps2d=eps2d, near_plane=near, packed=False, opacities=visible_opacities,
     )  # fmt: skip
     columns, lines = -(-camera.width // TILE), -(-camera.height // TILE)
     _, intersections, flatten_ids = gsplat.isect_tiles(

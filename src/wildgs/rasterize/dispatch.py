@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import num_sh_bases
-from wildgs.rasterize.interface import BackendName, Projection, Rendering
+from wildgs.rasterize.interface import EPS2D, BackendName, Projection, Rendering
 
 
 def pick_backend(device: torch.device | str) -> BackendName:
@@ -60,6 +60,7 @@ def project(
     backend: BackendName | None = None,
     near: float = 0.01,
     absgrad: bool = False,
+    eps2d: float = EPS2D,
 ) -> Projection:
     """Projects Gaussians into a camera and sorts them into tiles, for any number of `blend` calls.
 
@@ -76,6 +77,7 @@ def project(
         backend: Which implementation; None takes `cuda` for tensors on CUDA and `cpu` otherwise.
         near: Depth in world units up to which Gaussians are culled.
         absgrad: Collect absolute screen gradients in `Projection.absgrad` during the backward pass.
+        eps2d: Added to the diagonal of the 2D covariances, square pixels.
 
     Raises:
         ValueError: Shapes, devices or number types do not fit, or there is no such backend.
@@ -93,7 +95,7 @@ def project(
         _check(name, tensor, shape, means, backend)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the camera's picture has no pixels: {camera.width} x {camera.height}")
-    return module.project(means, quats, scales, opacities, camera, near, absgrad)
+    return module.project(means, quats, scales, opacities, camera, near, absgrad, eps2d)
 
 
 def blend(
@@ -184,13 +186,14 @@ def rasterize(
     backend: BackendName | None = None,
     near: float = 0.01,
     depth: bool = True,
+    eps2d: float = EPS2D,
 ) -> Rendering:
     """Renders Gaussians in one call: `project`, `sh_to_colors` if `sh_degree` is given, `blend`.
 
     `colors` are values per Gaussian, or spherical harmonics to evaluate at `sh_degree`. The other arguments and the
     errors are those of `project` and `blend`.
     """
-    projection = project(means, quats, scales, opacities, camera, backend=backend, near=near)
+    projection = project(means, quats, scales, opacities, camera, backend=backend, near=near, eps2d=eps2d)
     if sh_degree is not None:
         colors = sh_to_colors(means, colors, camera, degree=sh_degree, visible=projection.visible)
     return blend(projection, colors, background=background, depth=depth)

@@ -16,7 +16,7 @@ from wildgs.geometry.camera import Camera
 
 BackendName = Literal["cpu", "cuda", "reference"]
 
-DILATION = 0.3  # px^2 added to the 2D covariance's diagonal (gsplat's eps2d): nothing is thinner than a pixel
+EPS2D = 0.3  # px^2 added to the 2D covariance's diagonal, gsplat's default: nothing is thinner than a pixel
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is dropped at a pixel where its alpha is below
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave no more light than this ends the pixel and is dropped

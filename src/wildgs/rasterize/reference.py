@@ -14,7 +14,6 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
 from wildgs.rasterize.interface import (
-    DILATION,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
@@ -52,6 +51,7 @@ def project(
     camera: Camera,
     near: float,
     absgrad: bool,
+    eps2d: float,
 ) -> Projection:
     """See `wildgs.rasterize.project`."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
@@ -61,7 +61,7 @@ def project(
     points = means[chosen] @ viewmat[:3, :3].T + viewmat[:3, 3]
     spread = viewmat[:3, :3] @ quats_to_rotations(quats[chosen]) * scales[chosen, None, :]
     footprint = _jacobian(points, K, camera.width, camera.height) @ spread
-    covariance = footprint @ footprint.mT + DILATION * torch.eye(2).to(means)
+    covariance = footprint @ footprint.mT + eps2d * torch.eye(2).to(means)
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     determinant = a * c - b * b
     centres = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]

@@ -10,7 +10,6 @@ from wildgs.rasterize.cpu.simd_memory import vload3, vload4
 
 GROUP = 16
 CHUNK = 32  # groups that a thread takes at once
-DILATION = 0.3  # px^2 on the covariance's diagonal, as gsplat's eps2d
 MIN_ALPHA = 1.0 / 255.0
 LOG2_E = 1.4426950408889634
 

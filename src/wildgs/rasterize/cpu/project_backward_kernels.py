@@ -7,7 +7,6 @@ import numpy as np
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.footprint_kernels import (
     CHUNK,
-    DILATION,
     GROUP,
     camera_numbers,
     clamp_limits,
@@ -66,9 +65,9 @@ def project_group_backward(
     shrink, qw, qx, qy, qz, tx, ty = rest
 
     # conic = (c, -b, a) / (a c - b b). By way of the conics themselves a needle's small eigenvalue would be lost.
-    a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + DILATION
+    a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + lens[4]
     b = u[0] * u[3] + u[1] * u[4] + u[2] * u[5]
-    c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + DILATION
+    c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + lens[4]
     scale = 1.0 / select(ok, a * c - b * b, 1.0)
     ga, gb, gc = vload3(v_conics, 3 * i)
     v_mx, v_my = vload2(v_means2d, 2 * i)

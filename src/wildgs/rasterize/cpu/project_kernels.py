@@ -10,7 +10,6 @@ import numpy as np
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.footprint_kernels import (
     CHUNK,
-    DILATION,
     GROUP,
     LOG2_E,
     MIN_ALPHA,
@@ -111,9 +110,9 @@ def project_group(
     iz = 1.0 / select(in_front, z, 1.0)
 
     u, _, _ = footprint(i, quats, scales, R, lens, width, height, x, y, z, iz)
-    a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + DILATION
+    a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + lens[4]
     b = u[0] * u[3] + u[1] * u[4] + u[2] * u[5]
-    c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + DILATION
+    c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + lens[4]
     determinant = a * c - b * b
     opacity = vload(opacities, i)
     mx, my = lens[0] * x * iz + lens[2], lens[1] * y * iz + lens[3]

@@ -87,7 +87,7 @@ class TileLists:
 
 @dataclass(frozen=True)
 class _Lens:
-    """A camera as the kernels take it."""
+    """A camera as the kernels take it: `lens` is fx, fy, cx, cy, eps2d."""
 
     view: np.ndarray
     lens: np.ndarray
@@ -95,10 +95,10 @@ class _Lens:
     height: int
 
     @staticmethod
-    def of(camera: Camera) -> _Lens:
+    def of(camera: Camera, eps2d: float) -> _Lens:
         K = camera.K.detach().to("cpu", torch.float32)
         view = camera.viewmat.detach().to("cpu", torch.float32)[:3].contiguous().numpy().reshape(-1)
-        lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
+        lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], eps2d], np.float32)
         return _Lens(view, lens, camera.width, camera.height)
 
     def arguments(self) -> tuple[Any, ...]:
@@ -154,11 +154,12 @@ def project(
     camera: Camera,
     near: float,
     absgrad: bool,
+    eps2d: float,
 ) -> Projection:
     """See `wildgs.rasterize.project`."""
     n = len(means)
     means_, quats_, scales_, opacities_ = (_padded(t).contiguous() for t in (means, quats, scales, opacities))
-    lens = _Lens.of(camera)
+    lens = _Lens.of(camera, eps2d)
     count = len(means_)
     means2d, depths = torch.empty(count, 2), torch.empty(count)
     conics, radii = torch.empty(count, 3), torch.empty(count, dtype=torch.int32)
