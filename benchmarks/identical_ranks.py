@@ -20,7 +20,7 @@ import torch
 
 from train_step import make_scene
 from wildgs.engine.checkpoint import Checkpoint
-from wildgs.engine.density import DensityConfig
+from wildgs.engine.config import DensityConfig
 from wildgs.engine.distributed import join
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.team import Team

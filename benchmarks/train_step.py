@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 
 from resized_demo import write_resized_demo
-from wildgs.engine.density import DensityConfig
+from wildgs.engine.config import DensityConfig
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, method_type

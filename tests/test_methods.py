@@ -11,7 +11,7 @@ import torch
 
 from tests.engine.conftest import build_wall_scene
 from wildgs.config import RunConfig
-from wildgs.engine.density import DensityConfig
+from wildgs.engine.config import DensityConfig
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError

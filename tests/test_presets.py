@@ -41,6 +41,7 @@ MENDED = {
     "train.schedule.mask_every": 1,
     "train.schedule.planes_every": 1,
     "train.optimizer.short_runs": 0.0,
+    "train.density.strategy": "classic",
     "train.density.prune_by_distance": False,
     "train.density.prune_reach": 0.0,
     "train.density.reset_unseen": True,

@@ -36,12 +36,16 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.optimizer.short_runs": (0, 1),
     "train.density.reset_opacity": (1e-6, 1),
     "train.density.max_gaussians": (1, _MOST),
+    "train.density.grow_share": (0, 1),
+    "train.density.grow_error": (0, _MOST),
+    "train.density.least_pixels": (0, _MOST),
     "train.dropout.rate": (0, 0.9),
     "train.dropout.neighbours": (1, 1024),
     "model.mask_threshold": (0, 1),
     "model.matched_loss": (0, 1),
     "model.light_codes": (0, 64),
     "model.light_components": (0, 256),
+    "model.eps2d": (0.01, 10),
     "model.parsing.max_side": (16, 4096),
     "model.parsing.global_size": (1, 1024),
     "model.fusion.intrinsic_size": (3, 1024),
@@ -213,6 +217,7 @@ _BEFORE: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
     ("train", "schedule", "mask_every"): ("mask_pause", 1),
     ("train", "schedule", "planes_every"): ("mask_pause", 1),
+    ("train", "density", "strategy"): ("split_scale", "classic"),
 }
 """Entries that earlier versions' `config.yaml` does not have: an entry beside them that it does have, and the value
 with which a run that began so continues."""

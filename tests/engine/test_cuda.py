@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wildgs.engine.density import DensityConfig
+from wildgs.engine.config import DensityConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method, restore_method
 from wildgs.model.wildgs import WildGS, WildGSConfig

@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from wildgs.engine.density import DensityConfig, DensityControl
+from wildgs.engine.config import DensityConfig
+from wildgs.engine.density import ClassicDensity, DensityControl, SeenView
 from wildgs.engine.optimizers import OptimizerConfig, Optimizers
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.vanilla import VanillaConfig, VanillaGS
@@ -33,8 +34,8 @@ def controlled(
     for parameter in method.gaussians.parameters():
         parameter.grad = torch.ones_like(parameter)
     optimizers.step()
-    control = DensityControl(DensityConfig(**config), EXTENT, len(method.gaussians))  # type: ignore[arg-type]
-    control.gradient_sum = torch.tensor(gradients) * 3
+    control = ClassicDensity(DensityConfig(**config), EXTENT, len(method.gaussians))  # type: ignore[arg-type]
+    control.demand = torch.tensor(gradients) * 3
     control.seen = torch.full((4,), 3.0)
     return control, optimizers
 
@@ -70,7 +71,7 @@ def test_small_clones_large_splits_faint_goes(method: VanillaGS) -> None:
     halves = gaussians.scales[3:].detach()
     torch.testing.assert_close(halves, torch.full((2, 3), 0.05 / 1.6), rtol=0.1, atol=0)
     assert (gaussians.means[3:].detach() - means[1]).norm(dim=1).max() < 5 * 0.05
-    assert len(control.gradient_sum) == len(control.seen) == 5
+    assert len(control.demand) == len(control.seen) == 5
 
 
 def test_moments_follow_and_newcomers_start_at_rest(method: VanillaGS) -> None:
@@ -106,16 +107,16 @@ def test_oversized_and_broken_gaussians_go(method: VanillaGS) -> None:
 
 def test_what_fills_the_picture_goes_once_opacities_were_reset(method: VanillaGS) -> None:
     control, optimizers = controlled(method, [0.0] * 4)
-    control.reach = torch.tensor([0.1, 0.2, 0.0, 0.1])
+    control.largest = torch.tensor([0.1, 0.2, 0.0, 0.1])
     assert round_of(control, method, optimizers).pruned == 1, "the faint one"
-    control.reach = torch.tensor([0.1, 0.2, 0.1])
+    control.largest = torch.tensor([0.1, 0.2, 0.1])
     assert round_of(control, method, optimizers, large=True).pruned == 1
-    assert control.reach.tolist() == [0.0, 0.0]
+    assert control.largest.tolist() == [0.0, 0.0]
 
 
 def test_pruning_by_reach_can_be_switched_off(method: VanillaGS) -> None:
     control, optimizers = controlled(method, [0.0] * 4, prune_reach=0.0)
-    control.reach = torch.tensor([0.1, 0.9, 0.0, 0.1])
+    control.largest = torch.tensor([0.1, 0.9, 0.0, 0.1])
     assert round_of(control, method, optimizers, large=True).pruned == 1, "the faint one"
 
 
@@ -157,7 +158,7 @@ def test_reset_leaves_alone_what_no_photo_has_shown(method: VanillaGS) -> None:
     lowered = before.clamp(max=0.01)
     lowered[1] = before[1]
     torch.testing.assert_close(method.gaussians.opacities.detach(), lowered)
-    control = DensityControl(DensityConfig(reset_unseen=True), EXTENT, 4)
+    control = ClassicDensity(DensityConfig(reset_unseen=True), EXTENT, 4)
     control.reset_opacity(method.gaussians, optimizers.rows)
     torch.testing.assert_close(method.gaussians.opacities.detach(), before.clamp(max=0.01))
 
@@ -166,24 +167,25 @@ def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:
     """As 3DGS: the threshold means the same at any resolution."""
     from wildgs.geometry.camera import Camera
 
-    control = DensityControl(DensityConfig(), EXTENT, 4)
+    control = ClassicDensity(DensityConfig(), EXTENT, 4)
     K = torch.tensor([[50.0, 0, 32], [0, 50.0, 16], [0, 0, 1]])
     viewmat = torch.eye(4)
     viewmat[2, 3] = 6.0
     projection = method.gaussians.project(Camera(viewmat, K, 64, 32))
     projection.means2d.retain_grad()
     (projection.means2d * torch.tensor([3.0, 4.0])).sum().backward()
-    control.gather(projection)
+    blank = torch.zeros(32, 64, 3)
+    control.gather(SeenView(projection, blank, blank))
     expected = torch.where(projection.visible, torch.tensor([3.0 * 32, 4.0 * 16]).norm(), 0.0)
-    torch.testing.assert_close(control.gradient_sum, expected)
+    torch.testing.assert_close(control.demand, expected)
     assert torch.equal(control.seen, projection.visible.float())
-    torch.testing.assert_close(control.reach, projection.radii / 64)
+    torch.testing.assert_close(control.largest, projection.radii / 64)
 
 
 def test_restored_statistics_are_where_the_gaussians_are() -> None:
     """A resumed run may densify before a step has gathered anything."""
-    control = DensityControl(DensityConfig(), 1.0, 5, "meta")
-    control.restore(DensityControl(DensityConfig(), 1.0, 5).state())
+    control = ClassicDensity(DensityConfig(), 1.0, 5, "meta")
+    control.restore(ClassicDensity(DensityConfig(), 1.0, 5).state())
     assert {value.device.type for value in control.state().values()} == {"meta"}
 
 

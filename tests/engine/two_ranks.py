@@ -17,7 +17,8 @@ import torch
 
 from conftest import build_tiny_model, build_wall_scene
 from wildgs.engine.checkpoint import Checkpoint
-from wildgs.engine.density import DensityConfig
+from wildgs.engine.config import DensityConfig
+from wildgs.engine.density import SeenView
 from wildgs.engine.distributed import join
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.team import Team
@@ -25,6 +26,7 @@ from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses
 from wildgs.model.registry import MethodName, create_method
+from wildgs.scene import View
 
 METHODS: tuple[MethodName, ...] = ("3dgs", "wildgs")
 STEPS = 101
@@ -55,24 +57,31 @@ def found_in(trainer: Trainer, losses: list[Losses]) -> dict:
     }
 
 
+def step_forward(trainer: Trainer, view: View) -> tuple[SeenView, Losses]:
+    """A step up to its losses."""
+    photo, keep = trainer.feed.photo(view)
+    output, losses = trainer._forward(view, photo, keep)
+    return SeenView(output.projection, output.rendering.colors, photo), losses
+
+
 def first_gradients(output: Path, team: Team) -> None:
     """Both photos in two processes, and both in one, all parts of the method on."""
     for method in METHODS:
         together = trainer_for(method, team, EVERY_STEP)
         together.begin()
-        rendered, losses = together._forward(together.feed.next_view())
+        seen, losses = step_forward(together, together.feed.next_view())
         losses.total.backward()
         mean = team.average(together.method.parameters(), losses)
-        together.density.gather(rendered.projection, team.pool)
+        together.density.gather(seen, team.pool)
 
         alone = trainer_for(method, Team(), EVERY_STEP)
         alone.begin()
         both = []
         for index in alone.sampler.take(2):
-            rendered, losses = alone._forward(alone.views[index])
+            seen, losses = step_forward(alone, alone.views[index])
             (losses.total / 2).backward()
-            rendered.projection.means2d.grad *= 2
-            alone.density.gather(rendered.projection)
+            seen.projection.means2d.grad *= 2
+            alone.density.gather(seen)
             both.append(losses)
         found = {"together": found_in(together, [mean]), "alone": found_in(alone, both)}
         torch.save(found, output / f"gradients_{method}_{team.rank}.pt")

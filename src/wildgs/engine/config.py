@@ -17,10 +17,11 @@ class ScheduleConfig:
     Attributes:
         first_stage: Steps without triplane and depth loss, until the mask is useful.
         densify_from: First densification (3DGS: 500).
-        densify_until: Last densification and reset (3DGS: 15,000).
+        densify_until: Last densification and reset. By default the strategy's: 24,000 for relocation, and 15,000
+            (3DGS) for the others.
         densify_every: Between densifications (3DGS: 100); 0 = no densification, pruning and opacity resets.
-        reset_every: Between opacity resets; 0 = no resets. By default the method's: 3,000 for 3DGS, none for
-            Wild-GS.
+        reset_every: Between opacity resets; 0 = no resets. By default 3,000 for 3DGS and affine, and none for
+            Wild-GS and with the strategy relocation.
         mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
             like a transient.
         sh_every: Between raises of the active SH degree (3DGS: 1,000).
@@ -31,7 +32,7 @@ class ScheduleConfig:
 
     first_stage: int = 3000
     densify_from: int = 500
-    densify_until: int = 15_000
+    densify_until: int | None = None
     densify_every: int = 100
     reset_every: int | None = None
     mask_pause: int = 500
@@ -73,13 +74,19 @@ class OptimizerConfig:
     batch_scaling: Literal["sqrt", "none"] = "sqrt"
 
 
+Strategy = Literal["classic", "absgrad", "relocation"]
+
+
 @dataclass(frozen=True)
 class DensityConfig:
-    """Clone, split, prune, reset. Values are 3DGS's.
+    """Which Gaussians are added and taken away. Values are 3DGS's, but for those of relocation.
 
     Attributes:
+        strategy: 'classic' is 3DGS's: clones and splits by screen gradients; 'absgrad' reads absolute gradients
+            (AbsGS); 'relocation' splits what covers most error, and takes away what shows nothing. By default
+            relocation for Wild-GS, else classic.
         grow_gradient: Mean screen gradient above which a Gaussian grows, per half picture (3DGS's normalised
-            device coordinates).
+            device coordinates); absgrad multiplies it by 4.
         split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
         prune_opacity: Fainter Gaussians go.
         prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
@@ -90,9 +97,14 @@ class DensityConfig:
         reset_opacity: Opacities are lowered to this at a reset.
         reset_unseen: Whether resets also lower those of Gaussians that no photo has shown yet, as 3DGS does: no
             photo would raise them again.
+        grow_share: Of relocation: share of the Gaussians that one round splits, and that it takes away, at most.
+        grow_error: Of relocation: error that a Gaussian covers, below which it is not split; pixels times error,
+            mean over the photos that see it.
+        least_pixels: Of relocation: Gaussians that cover fewer pixels of any photo go.
         max_gaussians: Upper bound on the number of Gaussians, from the start.
     """
 
+    strategy: Strategy | None = None
     grow_gradient: float = 2e-4
     split_scale: float = 0.01
     prune_opacity: float = 0.005
@@ -101,6 +113,9 @@ class DensityConfig:
     prune_reach: float = 0.15
     reset_opacity: float = 0.01
     reset_unseen: bool = False
+    grow_share: float = 0.1
+    grow_error: float = 0.02
+    least_pixels: float = 0.5
     max_gaussians: int = 3_000_000
 
 

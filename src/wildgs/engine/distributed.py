@@ -20,7 +20,7 @@ from torch import Tensor
 from torch import distributed as dist
 
 from wildgs import processes
-from wildgs.engine.density import ScreenStatistics
+from wildgs.engine.density import ViewStatistics
 from wildgs.engine.team import DivergedRanksError, LostRankError, Team
 from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.losses.objective import Losses
@@ -189,13 +189,13 @@ class Ranks(Team):
             if somewhere and parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
 
-    def pool(self, statistics: ScreenStatistics) -> ScreenStatistics:  # noqa: D102 - as in Team
-        sums = torch.stack([statistics.gradient_sum, statistics.seen])
-        reach = statistics.reach.clone()
+    def pool(self, statistics: ViewStatistics) -> ViewStatistics:  # noqa: D102 - as in Team
+        sums = torch.stack([statistics.demand, statistics.seen])
+        largest = statistics.largest.clone()
         with _peers():
             sum_over_ranks([sums])
-            dist.all_reduce(reach, op=dist.ReduceOp.MAX)
-        return ScreenStatistics(gradient_sum=sums[0], seen=sums[1], reach=reach)
+            dist.all_reduce(largest, op=dist.ReduceOp.MAX)
+        return ViewStatistics(demand=sums[0], seen=sums[1], largest=largest)
 
     def _gather(self, value: Any) -> list[Any]:
         gathered: list[Any] = [None] * self.size

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from wildgs import features
@@ -161,7 +161,7 @@ def edit_rows(
     added: dict[str, Tensor],
     *,
     sort: bool = False,
-) -> None:
+) -> Int[Tensor, " M"]:
     """Drops and adds Gaussians, in parameters and optimiser state alike.
 
     Args:
@@ -170,6 +170,9 @@ def edit_rows(
         keep: Which present Gaussians stay, in their order.
         added: New Gaussians' rows, one tensor for every row name; they start with empty Adam moments.
         sort: Whether to put all of them in Morton order, see `sort_rows`; else the new ones come last.
+
+    Returns:
+        Which of the former Gaussians each is; -1 for new ones.
     """
     kept = keep.nonzero()[:, 0]
     count, new = len(kept), len(added["means"])
@@ -192,18 +195,22 @@ def edit_rows(
         )
 
     _change_rows(gaussians, optimizer, edited)
-    if sort and not once:
-        sort_rows(gaussians, optimizer)
+    origin = source.index_fill(0, places, -1)
+    return origin[sort_rows(gaussians, optimizer)] if sort and not once else origin
 
 
 @torch.no_grad()
-def sort_rows(gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+def sort_rows(gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> Int[Tensor, " N"]:
     """Puts Gaussians that are near in space near in memory, in parameters and optimiser state alike.
 
     What samples the triplane and scatters back to it then finds its neighbours' cells in the cache.
+
+    Returns:
+        Which of the former Gaussians each is.
     """
     order = morton_order(gaussians.means)
     _change_rows(gaussians, optimizer, lambda _, values, moments: values[order])
+    return order
 
 
 def _change_rows(

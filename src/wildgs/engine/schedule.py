@@ -25,13 +25,16 @@ _FLOOR_SHARE = 5
 class Schedule:
     """The schedules of one run."""
 
-    def __init__(self, config: ScheduleConfig, steps: int, reset_every: int = 3000) -> None:
+    def __init__(
+        self, config: ScheduleConfig, steps: int, reset_every: int = 3000, until: float = 0.5
+    ) -> None:
         """Scales a configuration in the paper's steps to a run.
 
         Args:
             config: In the paper's steps.
             steps: Length of the run.
             reset_every: The method's, where the configuration names none.
+            until: Share of the run in which Gaussians are densified, likewise.
         """
         self.steps = steps
         self.encoder_every = config.encoder_every
@@ -40,7 +43,8 @@ class Schedule:
         self._factor = steps / REFERENCE_STEPS
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
-        self.densify_until = self._scaled(config.densify_until, "densify_until")
+        last = round(until * REFERENCE_STEPS) if config.densify_until is None else config.densify_until
+        self.densify_until = self._scaled(last, "densify_until")
         self.densify_every = (
             self._scaled(config.densify_every, "densify_every") if config.densify_every else 0
         )

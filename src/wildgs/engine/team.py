@@ -10,7 +10,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from wildgs.engine.density import ScreenStatistics
+from wildgs.engine.density import ViewStatistics
 from wildgs.errors import UserError
 from wildgs.losses.objective import Losses
 from wildgs.model.method import Method
@@ -90,8 +90,8 @@ class Team:
         """
         return losses
 
-    def pool(self, statistics: ScreenStatistics) -> ScreenStatistics:
-        """All ranks' screen statistics as one: sums and maxima.
+    def pool(self, statistics: ViewStatistics) -> ViewStatistics:
+        """All ranks' statistics as one: sums and maxima.
 
         Raises:
             LostRankError: A rank is gone.

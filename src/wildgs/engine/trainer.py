@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs import features
 from wildgs.engine.config import TrainConfig
-from wildgs.engine.density import DensityControl, DensityReport
+from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.process_settings import ProcessSettings
@@ -117,11 +117,13 @@ class Trainer:
         self.device = method.gaussians.means.device
         self.step = 0
         self.seconds = 0.0
-        self.schedule = Schedule(config.schedule, config.steps, method.reset_every)
+        strategy = STRATEGIES[config.density.strategy or method.density]
+        resets = method.reset_every if strategy.resets else 0
+        self.schedule = Schedule(config.schedule, config.steps, resets, strategy.until)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size, config.steps)
-        self.density = DensityControl(config.density, extent, len(method.gaussians), self.device)
+        self.density = strategy(config.density, extent, len(method.gaussians), self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
         self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
@@ -179,11 +181,13 @@ class Trainer:
         start = time.perf_counter()
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
-        output, losses = self._forward(view)
+        photo, keep = self.feed.photo(view)
+        output, losses = self._forward(view, photo, keep)
+        seen = SeenView(output.projection, output.rendering.colors, photo, self._counting(output, keep))
         skipped = self._report_marked()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
-        skipped = self._take(output, losses) or skipped
+        skipped = self._take(seen, losses) or skipped
         before = self.step
         self.step = min(before + self.team.size, self.config.steps)
         taken = self.step - before
@@ -202,25 +206,34 @@ class Trainer:
             taken=taken,
         )
 
-    def _take(self, output: TrainingOutput, losses: Losses) -> str | None:
+    def _take(self, seen: SeenView, losses: Losses) -> str | None:
         """Lets the optimisers take the step unless it is not finite; why it was skipped, where that is known."""
-        gathers = self.schedule.gathers(self.step)
+        gathers = self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size)
         if self.skips_on_device:
             faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
             if gathers:
-                self.density.gather(output.projection, self.team.pool, faulty == 0)
+                self.density.gather(seen, self.team.pool, faulty == 0)
             self.optimizers.step(faulty)
             return None
         fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
         if fault is None:
             if gathers:
-                self.density.gather(output.projection, self.team.pool)
+                self.density.gather(seen, self.team.pool)
             self.optimizers.step()
         else:
             self.method.zero_grad(set_to_none=True)
             with self.team.propagate_errors():
                 self.guard.report(self.step + 1, fault, self.method)
         return fault
+
+    def _counting(
+        self, output: TrainingOutput, keep: Bool[Tensor, "H W"] | None
+    ) -> Bool[Tensor, "H W"] | None:
+        """Pixels that are neither transient nor masked by the user."""
+        if output.visibility is None:
+            return keep
+        static = output.visibility > self.method.mask_threshold
+        return static if keep is None else static & keep
 
     def _report_marked(self) -> str | None:
         """Reports the step before where it was skipped by the GPU, which has finished it by now; why it was."""
@@ -231,12 +244,13 @@ class Trainer:
             self.guard.report(*found, self.method)
         return found[1]
 
-    def _forward(self, view: View) -> tuple[TrainingOutput, Losses]:
-        photo, keep = self.feed.photo(view)
+    def _forward(
+        self, view: View, photo: Float[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None
+    ) -> tuple[TrainingOutput, Losses]:
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         dropout = self.config.dropout
         rate = dropout.rate_at(self.schedule.progress(self.step), len(self.views))
-        stage = replace(stage, dropout=rate, neighbours=dropout.neighbours)
+        stage = replace(stage, dropout=rate, neighbours=dropout.neighbours, absgrad=self.density.absgrad)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(

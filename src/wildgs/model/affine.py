@@ -244,7 +244,7 @@ class AffineGS(Method):
     ) -> TrainingOutput:
         """Renders under the photo's embedding; photos that joined after the start train under the mean."""
         learnt = self._learnt(name)
-        projection = self.gaussians.project(camera)
+        projection = self.gaussians.project(camera, absgrad=stage.absgrad)
         projection.means2d.retain_grad()
         appearance = Appearance(self._mean() if learnt is None else learnt)
         colors = self.paint(projection, appearance, stage.sh_degree)

@@ -259,9 +259,7 @@ class WildGSConfig:
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
     def __post_init__(self) -> None:
-        """Refuses to leave out what is not there, and Gaussians that are all blur or none."""
-        if not 0.01 <= self.eps2d <= 10:
-            raise UserError(f"eps2d {self.eps2d}: must be from 0.01 to 10")
+        """Refuses to leave out what is not there."""
         absent = [part for part in WRAPPING_PARTS if part in self.without]
         if absent and not self.local_embeddings:
             raise UserError(

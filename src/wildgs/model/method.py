@@ -34,6 +34,7 @@ class Method(nn.Module, ABC):
         gaussians: The Gaussians.
         config: An instance of `Config`.
         reset_every: Steps between opacity resets in a run of 30,000, where the schedule names none; 0 for none.
+        density: Strategy of density control, where the configuration names none.
         sh_degree: Degree of the spherical harmonics that `shade` gives.
         global_size: Length of the global embedding; 0 for a method that is not relightable.
         local_size: Length of the local embeddings; 0 for a method that has none.
@@ -46,6 +47,7 @@ class Method(nn.Module, ABC):
     Config: ClassVar[type]
     memory: ClassVar[MemoryUse]
     reset_every: ClassVar[int] = 3000
+    density: ClassVar[str] = "classic"
     relightable: ClassVar[bool] = True
 
     gaussians: Gaussians
@@ -260,7 +262,7 @@ class Method(nn.Module, ABC):
             keep: The user's own mask: pixels that are False are not read.
             name: The photo's, by which a method may keep what it learnt or computed of it.
         """
-        projection = self.gaussians.project(camera)
+        projection = self.gaussians.project(camera, absgrad=stage.absgrad)
         projection.means2d.retain_grad()
         colors = self.paint(projection, self.encode(photo, camera, keep, name=name), stage.sh_degree)
         return TrainingOutput(blend(projection, colors), projection, None)

@@ -24,6 +24,7 @@ class Stage:
         learn_planes: Whether the triplane's UNet takes gradients now.
         dropout: Share of the Gaussians that is left out now (see `wildgs.model.dropout`).
         neighbours: Gaussians that are left out together.
+        absgrad: Whether absolute screen gradients are collected.
     """
 
     explicit: bool = True
@@ -33,6 +34,7 @@ class Stage:
     learn_planes: bool = True
     dropout: float = 0.0
     neighbours: int = 8
+    absgrad: bool = False
 
 
 @dataclass(frozen=True)

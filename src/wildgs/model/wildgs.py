@@ -36,6 +36,7 @@ class WildGS(Method):
     Config: ClassVar[type] = WildGSConfig
     memory: ClassVar[MemoryUse] = MemoryUse(per_gaussian=6000, per_pixel=700, fixed=600 * 2**20)
     reset_every: ClassVar[int] = 0
+    density: ClassVar[str] = "relocation"
     config: WildGSConfig
 
     def __init__(
@@ -309,7 +310,7 @@ class WildGS(Method):
         factors = None
         if stage.dropout > 0:
             factors = opacity_factors(self.num_gaussians, stage.dropout, stage.neighbours, photo.device)
-        projection = self.gaussians.project(camera, factors=factors)
+        projection = self.gaussians.project(camera, absgrad=stage.absgrad, factors=factors)
         projection.means2d.retain_grad()
         if stage.explicit and self._wraps:
             with torch.set_grad_enabled(torch.is_grad_enabled() and stage.learn_planes):
