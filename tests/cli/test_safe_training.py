@@ -42,8 +42,8 @@ def call_at_step(monkeypatch: pytest.MonkeyPatch, step: int, action) -> None:
     """Runs an action in the middle of a step, once."""
     forward, done = Trainer._forward, []
 
-    def disturbed(self: Trainer, view):
-        result = forward(self, view)
+    def disturbed(self: Trainer, *arguments):
+        result = forward(self, *arguments)
         if self.step == step and not done:
             done.append(True)
             action(self)
@@ -213,7 +213,7 @@ def test_memory_that_runs_out_is_tried_again_with_fewer(
 def test_memory_that_runs_out_twice_is_a_users_mistake(
     landmark: Path, tmp_path: Path, wildgs, monkeypatch, capsys
 ) -> None:
-    def forward(self: Trainer, view):
+    def forward(self: Trainer, *arguments):
         out_of_memory(self)
 
     monkeypatch.setattr(Trainer, "_forward", forward)

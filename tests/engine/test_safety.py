@@ -31,8 +31,8 @@ def spoil_losses(trainer: Trainer, bad: set[int], monkeypatch: pytest.MonkeyPatc
     """Makes the loss (or only its gradient) of some steps no number."""
     forward = trainer._forward
 
-    def spoiled(view):
-        output, losses = forward(view)
+    def spoiled(*arguments):
+        output, losses = forward(*arguments)
         if trainer.step in bad:
             if gradient:
                 zero = trainer.method.gaussians.means.sum() * 0

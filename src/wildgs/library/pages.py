@@ -121,7 +121,7 @@ def baked(loaded: LoadedScene, look: Look) -> Splats:
     gaussians = loaded.gaussians
     values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, look.sh)
     sky = loaded.run.method.sky()
-    return Splats(*(value.detach().cpu().float() for value in values), None if sky is None else sky.cpu())
+    return Splats(*(value.detach().cpu().float() for value in values), sky=None if sky is None else sky.cpu())
 
 
 def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
