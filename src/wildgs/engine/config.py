@@ -115,7 +115,7 @@ class DensityConfig:
     reset_unseen: bool = False
     grow_share: float = 0.1
     grow_error: float = 0.02
-    least_pixels: float = 0.5
+    least_pixels: float = 1.0
     max_gaussians: int = 3_000_000
 
 
