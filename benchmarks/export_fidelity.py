@@ -156,7 +156,7 @@ def read_back(file: Path, kind: SplatFormat) -> Splats | None:
     )
     means, quats, scales, opacities, sh = (torch.from_numpy(np.array(a, dtype=np.float32)) for a in arrays)
     read = Splats(means, quats, scales.exp(), opacities.reshape(-1).sigmoid(), sh)
-    return read.turned(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if kind == "spz" else read
+    return read.rotated(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if kind == "spz" else read
 
 
 def pooled(first: list[torch.Tensor], second: list[torch.Tensor]) -> float:

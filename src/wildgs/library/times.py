@@ -14,8 +14,8 @@ def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, 
 
     Args:
         loaded: The run.
-        photos: Folder of the original photos; None looks in the scene folder of the run. Undistorted photos of
-            `wildgs sfm` have no EXIF blocks.
+        photos: Folder of the original photos; None looks in the scene folder of the run, where the undistorted
+            photos of `wildgs sfm` keep time and place.
     """
     if photos is None:
         try:
