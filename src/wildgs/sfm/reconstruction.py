@@ -16,10 +16,10 @@ from PIL import Image
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.processes import signals_as_interrupts
 from wildgs.progress import Progress, silent
+from wildgs.scene.capture import carry_capture
 from wildgs.scene.colmap import LAYOUTS
 from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
-from wildgs.sfm.capture import carry_capture
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import find_registered, quiet

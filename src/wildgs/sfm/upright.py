@@ -223,7 +223,7 @@ def gps_position(image: Image.Image) -> tuple[float, float] | None:
 def save_jpeg(picture: Image.Image, original: Image.Image, target: Path) -> None:
     """Write an upright picture with the entries of another one's EXIF block that can be read and written."""
     try:
-        exif = sound_entries(original.getexif())
+        exif = _sound_entries(original.getexif())
     except Exception:  # a broken EXIF block costs the focal length, not the photo
         exif = b""
     try:
@@ -232,7 +232,7 @@ def save_jpeg(picture: Image.Image, original: Image.Image, target: Path) -> None
         picture.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
 
 
-def sound_entries(exif: Image.Exif) -> bytes:
+def _sound_entries(exif: Image.Exif) -> bytes:
     """An EXIF block without the orientation and without entries that Pillow cannot write again."""
     sound = Image.Exif()
     for block in (None, EXIF_IFD, GPS_IFD):

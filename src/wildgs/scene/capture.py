@@ -1,4 +1,4 @@
-"""When and where a photo was taken, carried to its undistorted copy."""
+"""When and where a photo was taken, carried to copies of it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from pathlib import Path
 
 from PIL import Image
 from PIL.ExifTags import IFD, Base
-
-from wildgs.sfm.upright import sound_entries
 
 _START = b"\xff\xd8"
 _EXIF_SEGMENT = b"\xff\xe1"
@@ -25,8 +23,8 @@ _TIMES = (
 def carry_capture(source: Path, target: Path) -> None:
     """Gives a JPEG file the times and the position in another one's EXIF block, if it has any.
 
-    The pixels are not encoded again: the block is put before the file's other segments. Focal length and lens are
-    left out, since undistortion changes them.
+    The pixels are not encoded again: the block is put before the file's other segments. Focal length and
+    orientation are left out, since copies are undistorted and upright.
     """
     try:
         with Image.open(source) as image:
@@ -37,7 +35,7 @@ def carry_capture(source: Path, target: Path) -> None:
         kept.get_ifd(IFD.GPSInfo).update(exif.get_ifd(IFD.GPSInfo))
         if not any(kept.get_ifd(block) for block in (IFD.Exif, IFD.GPSInfo)):
             return
-        block = sound_entries(kept)
+        block = kept.tobytes()
     except Exception:  # a broken EXIF block costs the time, not the photo
         return
     content = target.read_bytes()

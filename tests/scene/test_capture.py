@@ -1,4 +1,4 @@
-"""Undistorted photos keep when and where they were taken."""
+"""Copies of photos keep when and where they were taken."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from wildgs.light.captures import read_capture
-from wildgs.sfm.capture import carry_capture
+from wildgs.scene.capture import carry_capture
 
 
 @pytest.fixture
