@@ -43,6 +43,7 @@ def carried(scene: Scene, folder: Path) -> Scene:
 
 def test_copies_tell_when_the_photo_was_taken(scene: Scene, tmp_path: Path) -> None:
     exif = Image.Exif()
+    exif[Base.Model] = "a camera"
     exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2020:05:01 17:00:00"
     view = scene.views[2]
     original = view.photos.file(view.name)
