@@ -5,13 +5,15 @@
 Every format is written under one appearance in the input's own frame, read back by an independent reader (gsply;
 for .splat and .sog first PlayCanvas's splat-transform, where it is on the PATH), and rendered there. The table
 gives, over held-out views, PSNR against the render of the run itself, and how far PSNR against the photos moves
-(the photos hold passers-by, so only the difference means something). The second table is the web page's: what each
-degree of the harmonics costs in bytes and in PSNR, cut plainly and fitted to the cameras' directions.
+(the photos hold passers-by, so only the difference means something). The second table is the web page's, under all
+of its lights, against renders of the run: what its bytes cost, and what each degree of the harmonics costs before
+they are rounded to bytes, fitted to the cameras' directions as in the page, and cut plainly.
 """
 
 from __future__ import annotations
 
 import argparse
+import gzip
 import shutil
 import subprocess
 import tempfile
@@ -23,7 +25,7 @@ import torch
 
 import wildgs as api
 from wildgs.exporters.formats import SplatFormat, write_splats
-from wildgs.exporters.page_scene import pack_scene
+from wildgs.exporters.page_scene import PackedScene, pack_scene
 from wildgs.exporters.splats import Splats
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
@@ -66,30 +68,65 @@ def main() -> None:
             again = [picture(read, back.apply_camera(view.camera), back.scale) for view in views]
             same, moved = pooled(original, again), shift(views, original, again)
             print(f"{kind:16}{megabytes(file):8.2f}{same:16.2f}{moved:19.3f}")
-    print_degrees(loaded, whole, views, original)
+    print_degrees(loaded, whole, views)
 
 
-def print_degrees(
-    loaded: api.LoadedScene, whole: Splats, views: list[View], original: list[torch.Tensor]
-) -> None:
+def print_degrees(loaded: api.LoadedScene, whole: Splats, views: list[View]) -> None:
     """The page's table."""
     viewpoints = viewpoints_of(loaded.views)
     lights = [item.sh.cpu() for item in page_looks(loaded)]
-    print(
-        f"\n{'page, degree':16}{'bytes a splat':>15}{'dB fitted':>12}{'dB cut':>10}   ({len(lights)} lights)"
-    )
+    original = pictures(whole, lights, views)
+    head = f"{'page, degree':16}{'bytes a splat':>15}{'dB encoded':>12}{'worst light':>13}"
+    print(f"\n{head}{'dB fitted':>12}{'dB cut':>10}   ({len(lights)} lights)")
     for degree in range(whole.sh_degree + 1):
-        fit = (
-            fit_truncation(whole.means, viewpoints, whole.sh_degree, degree)
-            if degree < whole.sh_degree
-            else None
+        fit = None
+        if degree < whole.sh_degree:
+            fit = fit_truncation(whole.means, viewpoints, whole.sh_degree, degree)
+        fitted, cut = ([truncate_sh(sh, degree, matrix) for sh in lights] for matrix in (fit, None))
+        packed = pack_scene(whole, [sh.numpy() for sh in fitted])
+        shown = pictures(*unpack_scene(packed), views)
+        each = len(views)
+        worst = min(pooled(original[i : i + each], shown[i : i + each]) for i in range(0, len(shown), each))
+        costs = [pooled(original, pictures(whole, shs, views)) for shs in (fitted, cut)]
+        size = len(packed.data) / len(whole)
+        print(
+            f"{degree:<16}{size:15.1f}{pooled(original, shown):12.2f}{worst:13.2f}{costs[0]:12.2f}{costs[1]:10.2f}"
         )
-        packed = pack_scene(whole, [truncate_sh(sh, degree, fit).numpy() for sh in lights])
-        costs = []
-        for matrix in (fit, None):
-            cut = whole.with_sh(truncate_sh(whole.sh, degree, matrix))
-            costs.append(pooled(original, [picture(cut, view.camera) for view in views]))
-        print(f"{degree:<16}{len(packed.data) / len(whole):15.1f}{costs[0]:12.2f}{costs[1]:10.2f}")
+
+
+def pictures(splats: Splats, lights: list[torch.Tensor], views: list[View]) -> list[torch.Tensor]:
+    """Of all views under each light."""
+    return [picture(splats.with_sh(sh), view.camera) for sh in lights for view in views]
+
+
+def unpack_scene(packed: PackedScene) -> tuple[Splats, list[torch.Tensor]]:
+    """What the page makes of its bytes, as `web/src/scene.js` does."""
+    header, count = packed.header, packed.header["count"]
+    data, planes, start = np.frombuffer(gzip.decompress(packed.data), np.uint8), {}, 0
+    for name, lines in header["planes"]:
+        planes[name] = data[start : start + lines * count].reshape(lines, count)
+        start += lines * count
+    high, middle, low = planes["means"].reshape(3, 3, count).astype(np.uint32).transpose(1, 0, 2)
+    least, most = (np.array(header["means"][key])[:, None] for key in ("least", "most"))
+    means = np.sinh(least + (high << 16 | middle << 8 | low) / 0xFFFFFF * (most - least)).T
+    scales = np.exp(header["scales"]["least"] + planes["scales"] * header["scales"]["step"]).T
+    words = sum(planes["quats"][byte].astype(np.uint32) << 8 * byte for byte in range(4))
+    small = np.stack([(words >> shift & 1023) / 1023 - 0.5 for shift in (0, 10, 20)], axis=1) * 2**0.5
+    largest = words >> 30
+    quats = np.empty((count, 4))
+    quats[np.arange(4)[None] != largest[:, None]] = small.reshape(-1)
+    quats[np.arange(count), largest] = np.sqrt((1 - np.square(small).sum(axis=1)).clip(0))
+    colors, codes, lights = header["colors"], planes["light0"], []
+    degrees = np.repeat(
+        np.arange(header["sh_degree"] + 1), [3 * (2 * d + 1) for d in range(header["sh_degree"] + 1)]
+    )
+    least, step = (np.array(colors[key])[degrees, None] for key in ("least", "step"))
+    for number in range(sum(name.startswith("light") for name, _ in header["planes"])):
+        codes = planes["light0"] + (planes[f"light{number}"] if number else np.uint8(0))
+        lights.append(torch.from_numpy((least + step * codes).T.astype(np.float32)).reshape(count, -1, 3))
+    opacities = planes["opacities"][0] / 255
+    arrays = (means, np.roll(quats, 1, axis=1), scales, opacities)
+    return Splats(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), lights[0]), lights
 
 
 def picture(splats: Splats, camera: Camera, scale: float = 1.0) -> torch.Tensor:
@@ -119,7 +156,7 @@ def read_back(file: Path, kind: SplatFormat) -> Splats | None:
     )
     means, quats, scales, opacities, sh = (torch.from_numpy(np.array(a, dtype=np.float32)) for a in arrays)
     read = Splats(means, quats, scales.exp(), opacities.reshape(-1).sigmoid(), sh)
-    return read.turned(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if kind == "spz" else read
+    return read.rotated(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if kind == "spz" else read
 
 
 def pooled(first: list[torch.Tensor], second: list[torch.Tensor]) -> float:

@@ -110,9 +110,9 @@ else:
     names = ["gsplat==1.5.3", "tyro", "shtab", "typeguard", "docstring-parser", "pycolmap", "filelock", "safetensors",
              "jaxtyping", "wadler-lindig", "rich", "markdown-it-py", "mdurl", "pygments", "numba", "llvmlite", "scipy",
              "transformers", "huggingface-hub", "tokenizers", "tensorboard", "pyyaml", "pillow", "beartype", "pytest",
-             "pytest-timeout", "iniconfig", "pluggy", "hypothesis", "sortedcontainers", "ninja"]
+             "pytest-timeout", "iniconfig", "pluggy", "hypothesis", "sortedcontainers", "packaging", "ninja"]
     wanted = [n for n in names if lacks(n.split("==")[0])]
-    options = ["--no-deps"]
+    options = ["--no-deps", "--retries", "1", "--timeout", "5"]
 print("missing:", *wanted)
 if wanted:
     sys.exit(subprocess.call([sys.executable, "-m", "pip", "install", *options, *wanted]))
@@ -125,7 +125,11 @@ for stage in "${stages[@]}"; do
       if [ -n "$dry" ]; then run install 20 "$reserve" "$python" -c 'import torch'; continue; fi
       export -f install
       export python wheels
-      run install 30 "$reserve" bash -c install
+      run install 60 "$reserve" bash -c install
+      if ! "$python" -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("gsplat") is None)'; then
+        echo "gpu.sh: gsplat is missing and could not be installed ($parts/install.log); --help says how to carry wheels" >&2
+        exit 1
+      fi
       ;;
     build)
       # Without a GPU gsplat's interface is compared, and nothing is built.
@@ -134,7 +138,8 @@ for stage in "${stages[@]}"; do
       run build 200 "$reserve" "${build[@]}"
       ;;
     parity)
-      run parity 60 "$reserve" "$python" -m pytest -q -p no:cacheprovider ${dry:+--collect-only} \
+      # Warnings of that machine's libraries are shown, not errors.
+      run parity 60 "$reserve" "$python" -m pytest -q -W default -p no:cacheprovider ${dry:+--collect-only} \
         -m "cuda" --junitxml "$parts/parity.xml" tests/rasterize/test_parity.py tests/model/test_cuda.py
       ;;
     eager) run eager 40 "$reserve" env CUDA_LAUNCH_BLOCKING=1 "$python" benchmarks/gpu_stages.py eager "${tiny[@]}" ;;
@@ -144,7 +149,7 @@ for stage in "${stages[@]}"; do
     render) run render 20 "$reserve" "$python" benchmarks/rasterize.py --json "${render_sizes[@]}" ;;
     features) run features 240 0 "$python" benchmarks/gpu_stages.py features "${tiny[@]}" ;;
     tests)
-      run tests 400 10 "$python" -m pytest -q -p no:cacheprovider -m cuda --junitxml "$parts/tests.xml" \
+      run tests 400 10 "$python" -m pytest -q -W default -p no:cacheprovider -m cuda --junitxml "$parts/tests.xml" \
         tests/rasterize tests/model tests/engine
       ;;
     train)

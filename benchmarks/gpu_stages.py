@@ -34,6 +34,8 @@ from wildgs.model.wildgs import WildGSConfig
 from wildgs.runs import default_device
 from wildgs.scene import Scene
 
+WARM_UP = 40
+"""Steps after which every shape of photo has its graphs, with and without a mask that learns."""
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "cudaMemcpy", "aten::item")
 
 
@@ -139,7 +141,7 @@ def profile(scene: Scene, size: Size) -> bool:
     for n in size.gaussians:
         for method in ("wildgs", "3dgs"):
             trainer = make_trainer(method, scene, n, default_device(), WildGSConfig())
-            for _ in range(24 if on_cuda else 1):
+            for _ in range(WARM_UP if on_cuda else 1):
                 trainer.advance()
             with torch.profiler.profile(activities=activities) as recorded:
                 for _ in range(size.profiled_steps):
@@ -170,7 +172,7 @@ def features(scene: Scene, size: Size) -> bool:
         os.environ["WILDGS_WITHOUT"] = without
         trainer = make_trainer("wildgs", scene, size.gaussians[0], default_device(), WildGSConfig())
         times = []
-        for _ in range(2 * size.profiled_steps + 24 * (default_device().type == "cuda")):
+        for _ in range(2 * size.profiled_steps + WARM_UP * (default_device().type == "cuda")):
             start = time.perf_counter()
             trainer.advance()
             if default_device().type == "cuda":

@@ -3,6 +3,7 @@
     python benchmarks/launches.py                     3,000 Gaussians at 128x96: counts depend little on sizes
     python benchmarks/launches.py --n 1000000 --width 1000        bytes do
     python benchmarks/launches.py --eager             networks without graphs
+    python benchmarks/launches.py --local-embeddings  with the triplane; --matched-loss 0 without the colour match
     python benchmarks/launches.py --json
 
 The step is the one of CUDA (gsplat, mixed precision, graphs), on `pretend_cuda`'s device; gsplat's functions count
@@ -29,8 +30,9 @@ import torch
 from train_step import METHODS, make_scene, make_trainer
 from wildgs.model.wildgs import WildGSConfig
 
-FIRST_STEPS = 24
-"""Steps after which all graphs are recorded: every shape of the scene has come often enough."""
+FIRST_STEPS = 40
+"""Steps after which all graphs are recorded: every shape of the scene has come often enough, with and without a
+mask that learns."""
 
 
 @dataclass
@@ -56,7 +58,7 @@ class Count:
     by_operation: dict[str, float]
 
 
-def count(n: int, width: int, first_steps: int, graphs: bool) -> list[Count]:
+def count(n: int, width: int, first_steps: int, graphs: bool, model: WildGSConfig) -> list[Count]:
     """Both methods."""
     counts = []
     with tempfile.TemporaryDirectory() as folder:
@@ -64,7 +66,7 @@ def count(n: int, width: int, first_steps: int, graphs: bool) -> list[Count]:
         for method in METHODS:
             with pretend_cuda.device() as record:
                 before = record.graphs
-                trainer = make_trainer(method, scene, n, torch.device("cuda"), WildGSConfig(), graphs=graphs)
+                trainer = make_trainer(method, scene, n, torch.device("cuda"), model, graphs=graphs)
                 for _ in range(first_steps):
                     trainer.advance()
                 record.clear()
@@ -101,10 +103,15 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=128, help="of the photos' long side")
     parser.add_argument("--first-steps", type=int, default=FIRST_STEPS, help="before those that count")
     parser.add_argument("--eager", action="store_true", help="networks without graphs")
+    parser.add_argument("--local-embeddings", action="store_true", help="with the triplane")
+    parser.add_argument(
+        "--matched-loss", type=float, default=WildGSConfig.matched_loss, help="as wildgs train"
+    )
     parser.add_argument("--json", action="store_true", help="only the counts, on stdout")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    counts = count(options.n, options.width, options.first_steps, not options.eager)
+    model = WildGSConfig(local_embeddings=options.local_embeddings, matched_loss=options.matched_loss)
+    counts = count(options.n, options.width, options.first_steps, not options.eager, model)
     if options.json:
         json.dump([asdict(each) for each in counts], sys.stdout, indent=1)
     else:

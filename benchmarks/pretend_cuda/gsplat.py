@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import sh_basis
 from wildgs.rasterize import Projection, blend, project
+from wildgs.rasterize.interface import TILE
 
 from .tensors import RECORD, Pretended
 
@@ -92,16 +93,23 @@ class StandIn:
 
     def rasterize_to_pixels(
         self, means2d: Tensor, conics: Tensor, values: Tensor, opacities: Tensor, *_: Any,
-        packed: bool, absgrad: bool,
+        masks: Tensor | None, packed: bool, absgrad: bool,
     ) -> Any:  # fmt: skip
-        """Sums of values, and alpha."""
+        """Sums of values, and alpha, which is not written in tiles that are masked."""
         assert self.projection is not None
         seen = dataclasses.replace(self.projection, depths=self.projection.depths.detach())
 
         def compute(means2d: Tensor, conics: Tensor, values: Tensor, opacities: Tensor) -> Any:
             moved = dataclasses.replace(seen, means2d=means2d[0], conics=conics[0], opacities=opacities[0])
             rendering = blend(moved, values[0], depth=False)
-            return rendering.colors[None], rendering.alpha[None, ..., None]
+            colors, alpha = rendering.colors, rendering.alpha
+            if masks is not None:
+                assert isinstance(masks, Pretended)
+                there = masks.inner[0].repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
+                there = there[: alpha.shape[0], : alpha.shape[1]]
+                colors = torch.where(there[..., None], colors, 0)
+                alpha = torch.where(there, alpha, torch.nan)
+            return colors[None], alpha[None, ..., None]
 
         return _Kernel.apply("rasterise", compute, means2d, conics, values, opacities)
 

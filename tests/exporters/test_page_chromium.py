@@ -212,7 +212,7 @@ def test_a_link_that_makes_no_sense_opens_the_first_view(opened: dict[str, Any])
 
 def test_a_day_passes_while_it_plays(chromium, splats: Splats, tmp_path: Path) -> None:
     shade = np.full((20, 30, 3), 90, np.uint8)
-    lights = [PageLight(f"{n}.jpg", splats.sh[:, :1] + 0.3 * n, shade) for n in range(3)]
+    lights = [PageLight(f"{n}.jpg", splats.sh[:, :1] + 0.3 * n, shade) for n in range(6)]
     few = splats.with_sh(splats.sh[:, :1])
     page = Page("A day", "", few, lights, PageView(_camera(), 7.0), NEAR, day=True)
     write_page(page, tmp_path / "day.html")
@@ -220,6 +220,9 @@ def test_a_day_passes_while_it_plays(chromium, splats: Splats, tmp_path: Path) -
     tab.goto((tmp_path / "day.html").as_uri())
     tab.wait_for_function("document.documentElement.dataset.state", timeout=PATIENCE)
     assert tab.locator("#play").inner_text() == "Day"
+    slider = tab.locator("#slider").bounding_box()
+    assert slider["x"] >= 0
+    assert slider["x"] + slider["width"] <= 200, "the evening is out of reach"
     tab.locator("#play").click()
     tab.wait_for_function("Number(document.getElementById('slider').value) > 0.4", timeout=PATIENCE)
     tab.wait_for_function("Number(document.getElementById('slider').value) > 1.2", timeout=PATIENCE)

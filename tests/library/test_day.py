@@ -16,6 +16,8 @@ import wildgs
 from wildgs.errors import UserError
 from wildgs.library.config import TrajectoryOptions
 from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day
+from wildgs.library.times import read_captures
+from wildgs.scene.capture import carry_capture
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,23 @@ def test_times_of_the_original_photos_are_read(run: Path, tmp_path: Path) -> Non
         Image.new("RGB", (8, 6)).save(tmp_path / view.name, exif=exif)
     day = find_day(scene, tmp_path)  # seven photos with a time are too few to be believed
     assert not day.by_time
+
+
+def test_a_run_without_its_scene_knows_the_times(run: Path, tmp_path: Path) -> None:
+    alone = Path(shutil.copytree(run, tmp_path / "run"))
+    config = alone / "config.yaml"
+    scene = str(wildgs.load(run).run.config.scene)
+    config.write_text(
+        config.read_text(encoding="utf-8").replace(scene, str(tmp_path / "gone")), encoding="utf-8"
+    )
+    loaded = wildgs.load(alone)
+    assert read_captures(loaded) == {}
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2020:05:01 17:00:00"
+    name = loaded.views[3].name
+    Image.new("RGB", (8, 6)).save(tmp_path / "timed.jpg", exif=exif)
+    carry_capture(tmp_path / "timed.jpg", loaded.views[3].photos.file(name))
+    assert {name: capture.local.hour for name, capture in read_captures(loaded).items()} == {name: 17}
 
 
 def test_the_pictures_change_at_an_even_pace(run: Path) -> None:

@@ -14,10 +14,34 @@ from wildgs.model.color_match import (
     changed_harmonics,
     elevation_powers,
     mapped,
-    match_colors,
-    match_sky,
+    match_photo,
 )
 from wildgs.model.sky import Sky
+from wildgs.rasterize import Rendering
+
+
+def match_colors(
+    render: torch.Tensor,
+    photo: torch.Tensor,
+    weights: torch.Tensor,
+    training: bool = False,
+    codes: torch.Tensor | None = None,
+    sky: Sky | None = None,
+) -> torch.Tensor:
+    """The match where the mask is these weights."""
+    picture = Rendering(render, torch.ones_like(weights), torch.ones_like(weights))
+    codes = render[..., :0] if codes is None else codes
+    return match_photo(photo, picture, weights, None, threshold=0.0, sky=sky, codes=codes, training=training)
+
+
+def match_sky(
+    render: torch.Tensor, photo: torch.Tensor, sine: torch.Tensor, training: bool = False
+) -> torch.Tensor:
+    """The match of a picture that is all sky."""
+    sky = Sky(torch.ones_like(sine, dtype=torch.bool), sine)
+    found = match_colors(render, photo, torch.ones_like(sine), training, sky=sky)
+    assert not found[:, :4].any()
+    return found[:, 4:]
 
 
 def changed(colors: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
@@ -89,7 +113,7 @@ def test_the_skys_map_may_vary_with_the_elevation(seed: int) -> None:
     sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
     change = 0.2 * (torch.rand(3, SKY_COLUMNS, generator=generator) - 0.5)
     photo = changed(render, change[:, :4]) + elevation_powers(sine) @ change[:, 4:].T
-    found = match_sky(render, photo, torch.ones(24, 30), sine)
+    found = match_sky(render, photo, sine)
     matched = changed(render, found[:, :4]) + elevation_powers(sine) @ found[:, 4:].T
     torch.testing.assert_close(matched, photo, atol=0.01, rtol=0)
 
@@ -138,7 +162,7 @@ def test_in_training_channels_do_not_mix() -> None:
     render = grey + 0.05 * torch.randn(24, 30, 3, generator=generator)
     photo = torch.tensor([0.8, 1.0, 0.6]) * grey.expand(24, 30, 3) + 0.1
     weights, sine = torch.ones(24, 30), torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
-    for found in (match_colors(render, photo, weights, True), match_sky(render, photo, weights, sine, True)):
+    for found in (match_colors(render, photo, weights, True), match_sky(render, photo, sine, True)):
         off_diagonal = ~torch.eye(3, dtype=torch.bool)
         assert not found[:, :3][off_diagonal].any()
         assert float((changed(render, found[:, :4]) - photo).abs().mean()) < 0.06
@@ -146,3 +170,20 @@ def test_in_training_channels_do_not_mix() -> None:
     hue = torch.tensor([1.0, -1.0, 0.0])
     kept = (hue + free[:, :3] @ hue).norm() / hue.norm()
     assert float(kept) < 0.5, "the full map does take it away"
+
+
+@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("codes", [0, 1, 5])
+def test_landmark_and_sky_are_matched_as_each_alone(training: bool, codes: int) -> None:
+    """They are solved together, with terms that the other has not."""
+    generator = torch.Generator().manual_seed(0)
+    render = torch.rand(24, 30, 3, generator=generator)
+    photo = torch.rand(24, 30, 3, generator=generator)
+    light = torch.rand(24, 30, codes, generator=generator)
+    sine = torch.linspace(0.8, 0.0, 24)[:, None].expand(24, 30)
+    which = sine > 0.4
+    found = match_colors(render, photo, torch.ones(24, 30), training, light, Sky(which, sine))
+    own = match_colors(render, photo, (~which).float(), training, light)
+    above = match_sky(render[:12], photo[:12], sine[:12], training)
+    torch.testing.assert_close(found, torch.cat([own, above], dim=1), atol=1e-6, rtol=1e-5)
+    assert int(which.sum()) == 12 * 30

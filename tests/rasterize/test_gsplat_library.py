@@ -14,7 +14,7 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
-from wildgs.rasterize import blend, cuda, gsplat_library, project, sh_to_colors
+from wildgs.rasterize import blend, blend_sample, cuda, gsplat_library, project, sh_to_colors
 from wildgs.rasterize.gsplat_library import check_interface, load_gsplat
 
 gsplat = pytest.importorskip("gsplat")
@@ -142,6 +142,8 @@ def test_calls_pass_the_checks_of_the_installed_gsplat(
     wanted = torch.full((3,), 0.5) + (0 if background is None else 0.75 * background)
     torch.testing.assert_close(rendering.colors[5, 6], wanted)
     assert float(rendering.depth[0, 0]) == pytest.approx(0.5 / 0.25)
+    sample, (rows, _) = blend_sample(projection, colors, tiles=4, every=3)
+    assert sample.colors.shape == (len(rows), 3)
     load_gsplat.cache_clear()
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
-from wildgs.rasterize import Projection, Rendering, blend, project, sh_to_colors
+from wildgs.rasterize import Projection, Rendering, blend, blend_sample, project, sh_to_colors
 
 BACKENDS = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 
@@ -224,3 +224,41 @@ def test_colours_agree_with_gsplats_torch_functions():
     sh = torch.randn(300, 16, 3, generator=torch.Generator().manual_seed(3))
     expected = (gsplat._spherical_harmonics(3, directions, sh) + 0.5).clamp(min=0)
     assert torch.allclose(sh_to_colors(case.means, sh, case.camera, degree=3), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", [*BACKENDS, "reference"])
+def test_a_sample_shows_what_the_whole_shows(backend: str):
+    """At pixels all over the picture, drawn anew each time, and the same for every backend."""
+    device = "cuda" if backend == "cuda" else "cpu"
+    case = random_case(200, 150, 130, channels=4)
+    values = case.colors.to(device)
+    inputs = [tensor.to(device) for tensor in case.inputs()[:4]]
+    projection = project(*inputs, case.camera.to(device), backend=backend)
+    whole = blend(projection, values)
+    seen = torch.zeros(130, 150, dtype=torch.bool)
+    torch.manual_seed(0)
+    draws = [blend_sample(projection, values, tiles=20, every=3) for _ in range(8)]
+    for part, (rows, columns) in draws:
+        assert 10 * 25 < len(rows) < 30 * 25
+        assert not {0, 2, 15} & set((rows % 16).tolist() + (columns % 16).tolist())
+        for name, found in vars(part).items():
+            torch.testing.assert_close(found, getattr(whole, name)[rows, columns], atol=1e-5, rtol=1e-5)
+        seen[rows.cpu(), columns.cpu()] = True
+    assert seen[1::16, 1::16].all()
+    torch.manual_seed(0)
+    _, pixels = blend_sample(project(*case.inputs()[:4], case.camera), case.colors, tiles=20, every=3)
+    assert torch.equal(torch.stack(draws[0][1]).cpu(), torch.stack(pixels))
+
+
+@pytest.mark.parametrize("backend", [*BACKENDS, "reference"])
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (7, 40), (16, 3)])
+def test_a_sample_of_few_pixels(backend: str, width: int, height: int):
+    device = "cuda" if backend == "cuda" else "cpu"
+    case = random_case(20, width, height)
+    projection = project(
+        *[tensor.to(device) for tensor in case.inputs()[:4]], case.camera.to(device), backend=backend
+    )
+    part, (rows, columns) = blend_sample(projection, case.colors.to(device), tiles=40, every=3)
+    assert part.colors.shape == (len(rows), 3)
+    assert len(rows) == len(range(1, height, 3)) * len(range(1, width, 3))
+    assert len(columns) == len(part.alpha)

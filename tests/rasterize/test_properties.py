@@ -135,21 +135,3 @@ def test_several_threads_render_at_once():
         job.join()
     assert len(results) == 4
     assert all(torch.equal(picture, expected.colors) for picture in results)
-
-
-@pytest.mark.parametrize("background", [None, torch.tensor([0.1, 0.2, 0.3, 0.4])])
-def test_a_sample_of_the_tiles_shows_what_the_whole_shows(background: Tensor | None):
-    inputs, camera = scene(3, 300, width=150, height=100)
-    values = torch.rand(300, 4)
-    projection = project(*inputs[:4], camera)
-    whole = blend(projection, values, background=background)
-    written = torch.zeros(100, 150, dtype=torch.bool)
-    for _ in range(12):  # tiles are drawn anew each time
-        part = blend(projection, values, background=background, sample_tiles=20)
-        there = part.colors.any(dim=-1)
-        assert 0.2 < there.float().mean() / (whole.colors.any(dim=-1)).float().mean() < 0.5
-        for seen, truth in zip(vars(part).values(), vars(whole).values(), strict=True):
-            assert torch.equal(seen[there], truth[there])
-            assert not seen[~there].any()
-        written |= there
-    assert torch.equal(written, whole.colors.any(dim=-1))

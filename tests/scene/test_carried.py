@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from tests.memory_views import make_view
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
+from wildgs.light.captures import read_capture
 from wildgs.scene import Alignment, DataConfig, Scene, load_scene
 from wildgs.scene import carried as module
 from wildgs.scene.carried import SCENE_FILE, carried_side, carry_scene, describe_carried, read_carried_scene
@@ -37,6 +39,21 @@ def carried(scene: Scene, folder: Path) -> Scene:
     found = read_carried_scene(folder)
     assert found is not None
     return found
+
+
+def test_copies_tell_when_the_photo_was_taken(scene: Scene, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[Base.Model] = "a camera"
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2020:05:01 17:00:00"
+    view = scene.views[2]
+    original = view.photos.file(view.name)
+    assert original is not None
+    with Image.open(original) as image:
+        image.copy().save(original, exif=exif)
+    found = carried(scene, tmp_path / "run")
+    files = [view.photos.file(view.name) for view in found.views]
+    captures = [read_capture(file) for file in files if file is not None]
+    assert [capture and capture.local.hour for capture in captures] == [None, None, 17, *6 * [None]]
 
 
 def test_cameras_points_and_split_come_back_bit_for_bit(scene: Scene, tmp_path: Path) -> None:

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.light.captures import read_capture
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.colmap import read_model
 from wildgs.sfm import matching, reconstruction
@@ -58,6 +60,7 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     )  # stored on its side, with the orientation that rights it
     exif = turned.getexif()
     exif[0x0112] = 6
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2019:07:01 19:30:00"
     turned.save(folder / "phone/photo 3.jpg", quality=95, exif=exif)
     alpha = np.full(photos[4].shape[:2], 255, dtype=np.uint8)
     alpha[:, :60] = 0
@@ -116,6 +119,16 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     for view in scene.views:
         assert view.camera.width > view.camera.height  # upright
         assert view.camera.viewmat[1, 2] < -0.9 or view.camera.up[2] > 0.9
+    captures = [read_capture(tmp_path / "scene/images" / name) for name in names]
+    assert [capture and capture.local.hour for capture in captures] == [
+        None,
+        19,
+        None,
+        None,
+        None,
+        None,
+        None,
+    ]
     mask = scene.views[5].read_mask()
     assert mask is not None
     assert (mask[:, :50] == 0).all()

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from wildgs.devices import upload
 from wildgs.engine.team import Team
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene import View
 from wildgs.scene.image_cache import AHEAD
-from wildgs.scene.scene import upload
 
 
 class ViewSampler:

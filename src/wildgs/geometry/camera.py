@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -66,21 +66,29 @@ class Camera:
         return pixels[:, :2] / pixels[:, 2:], seen[:, 2]
 
     def unproject(
-        self, depth: Float[Tensor, "h w"], pixels: tuple[slice, slice] = (slice(None), slice(None))
-    ) -> Float[Tensor, "h w 3"]:
+        self,
+        depth: Float[Tensor, "*pixels"],
+        pixels: tuple[Int[Tensor, "*pixels"], Int[Tensor, "*pixels"]] | None = None,
+    ) -> Float[Tensor, "*pixels 3"]:
         """World coordinates of pixel centres at depths along z (not along the ray), world units.
 
         Args:
             depth: Of the pixels.
-            pixels: Rows and columns that `depth` has; by default all.
+            pixels: Their rows and columns; None for the whole picture.
         """
-        rays = self.pixel_rays()[pixels]
+        rays = self.pixel_rays(pixels)
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
         return (rays * depth[..., None] - translation) @ rotation
 
-    def pixel_rays(self) -> Float[Tensor, "H W 3"]:
-        """Camera-space rays through the pixel centres, scaled to z = 1."""
-        x = (torch.arange(self.width, device=self.K.device) + 0.5 - self.K[0, 2]) / self.K[0, 0]
-        y = (torch.arange(self.height, device=self.K.device) + 0.5 - self.K[1, 2]) / self.K[1, 1]
-        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-        return torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], dim=-1)
+    def pixel_rays(
+        self, pixels: tuple[Int[Tensor, "*pixels"], Int[Tensor, "*pixels"]] | None = None
+    ) -> Float[Tensor, "*pixels 3"]:
+        """Camera-space rays through the pixel centres, scaled to z = 1; `pixels` as for `unproject`."""
+        if pixels is None:
+            sides = (torch.arange(side, device=self.K.device) for side in (self.height, self.width))
+            y, x = torch.meshgrid(*sides, indexing="ij")
+        else:
+            y, x = pixels
+        x = (x + 0.5 - self.K[0, 2]) / self.K[0, 0]
+        y = (y + 0.5 - self.K[1, 2]) / self.K[1, 1]
+        return torch.stack([x, y, torch.ones_like(x)], dim=-1)

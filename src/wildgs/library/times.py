@@ -14,16 +14,23 @@ def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, 
 
     Args:
         loaded: The run.
-        photos: Folder of the original photos; None looks in the scene folder of the run. Undistorted photos of
-            `wildgs sfm` have no EXIF blocks.
+        photos: Folder of the original photos; None looks in the scene folder of the run, where the undistorted
+            photos of `wildgs sfm` keep time and place, and at the run's own copies of its photos.
     """
-    if photos is None:
-        try:
-            photos = find_model(Path(loaded.run.config.scene))[1]
-        except Exception:  # a run works without its scene folder
-            return {}
-    found = {view.name: read_capture(photos / view.name) for view in loaded.views}
+    found = {}
+    folder = photos or _scene_photos(loaded)
+    for view in loaded.views:
+        files = [folder and folder / view.name, None if photos else view.photos.file(view.name)]
+        captures = (read_capture(file) for file in files if file is not None)
+        found[view.name] = next((capture for capture in captures if capture is not None), None)
     return {name: capture for name, capture in found.items() if capture is not None}
+
+
+def _scene_photos(loaded: LoadedScene) -> Path | None:
+    try:
+        return find_model(Path(loaded.run.config.scene))[1]
+    except Exception:  # a run works without its scene folder
+        return None
 
 
 def read_times(loaded: LoadedScene) -> dict[str, str]:

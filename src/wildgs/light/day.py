@@ -30,7 +30,8 @@ LEAST_PHOTOS = 5
 
 _ROUGH = (4, 0.1)
 _TIMED = (8, 0.005)
-"""Principal components, and ridge, with which rough statistics and times teach the axis."""
+"""Principal components, and ridge: times teach the axis on them; rough statistics teach it on the patterns as they
+are, with a ridge that is a share of their variance, and only the side of the sun is sought among the components."""
 
 _PHOTOS_PER_COMPONENT = 4
 _LEAST_TIMED = 8
@@ -126,7 +127,7 @@ def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day
             chosen = [index for index, keep in zip(timed, kept, strict=True) if keep]
             return _day(names, axes, np.array(chosen), phases[kept], left, by_time=True)
     axes = _components(luminance, _ROUGH[0])
-    height = _learn(axes, _rough_height(list(patterns.values())), _ROUGH[1])
+    height = _learn(_by_variance(luminance), _rough_height(list(patterns.values())), _ROUGH[1])
     # Light alone does not tell a rising sun from a setting one: the side from which it comes does, but not which is
     # which. The side is taken to be what varies most besides the height.
     side = axes - np.outer(height, axes.T @ height / (height @ height))
@@ -142,6 +143,12 @@ def _components(luminance: Float[np.ndarray, "P M"], count: int) -> Float[np.nda
     count = max(2, min(count, len(luminance) // _PHOTOS_PER_COMPONENT))
     left = np.linalg.svd(centred, full_matrices=False)[0][:, :count]
     return left * np.sqrt(len(luminance))
+
+
+def _by_variance(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P _"]:
+    """All principal components of the patterns, as they vary, of variance 1 together."""
+    left, spread, _ = np.linalg.svd(luminance - luminance.mean(axis=0), full_matrices=False)
+    return left * spread * np.sqrt(len(luminance)) / max(np.linalg.norm(spread), 1e-12)
 
 
 def _rough_height(patterns: Sequence[Pattern]) -> Float[np.ndarray, " P"]:

@@ -7,9 +7,12 @@ colours is found in closed form, from one render, and brings most of what many s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.sky import Sky
@@ -55,41 +58,15 @@ def mapped(
 
 
 @torch.no_grad()
-def match_colors(
-    render: Float[Tensor, "H W 3"],
-    photo: Float[Tensor, "H W 3"],
-    weights: Float[Tensor, "H W"],
-    training: bool = False,
-    codes: Float[Tensor, "H W L"] | None = None,
-) -> Float[Tensor, "3 M"]:
-    """The affine map of colours that takes a render to its photo, by robust least squares.
-
-    Args:
-        render: In 0..1, more where the scene is brighter than white, less where it is below black.
-        photo: In 0..1.
-        weights: Of the pixels, 0 or more; 0 where something stands in the way.
-        training: Whether each channel has a gain of its own and no share in the others.
-        codes: Further terms; None for none.
-
-    Returns:
-        Change [A | b | W]: colours c become ``c + A c + b + W codes``. Zero where too little of the scene is seen.
-    """
-    further = torch.ones_like(weights)[..., None]
-    if codes is not None:
-        further = torch.cat([further, codes], dim=2)
-    return _fitted(render, photo, weights, further, training)
-
-
-@torch.no_grad()
 def match_photo(
-    photo: Float[Tensor, "H W 3"],
+    photo: Float[Tensor, "*pixels 3"],
     rendering: Rendering,
-    visibility: Float[Tensor, "H W"] | None,
-    keep: Bool[Tensor, "H W"] | None,
+    visibility: Float[Tensor, "*pixels"] | None,
+    keep: Bool[Tensor, "*pixels"] | None,
     *,
     threshold: float,
     sky: Sky | None,
-    codes: Float[Tensor, "H W L"],
+    codes: Float[Tensor, "*pixels L"],
     training: bool = False,
 ) -> Float[Tensor, "3 M"]:
     """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
@@ -107,19 +84,20 @@ def match_photo(
         training: Gives each channel a gain of its own, no more.
 
     Returns:
-        As `match_colors`, [A | b | W]; with a sky, that of `match_sky` beside it.
+        Change [A | b | W] of the landmark: colours c become ``c + A c + b + W codes``; with a sky, its change
+        [A | b | E] beside it: ``c + A c + b + E @ elevation_powers(sine)``. Zero where too little is seen.
     """
     static = liftable(visibility, rendering.alpha, threshold)
     covered = rendering.alpha > MIN_ALPHA
     if keep is not None:
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
-    colors = rendering.colors
-    if sky is None:
-        return match_colors(colors, photo, weights, training, codes)
-    own = match_colors(colors, photo, weights * ~sky.which, training, codes)
-    of_sky = match_sky(colors, photo, (covered & sky.which).float(), sky.sine, training)
-    return torch.cat([own, of_sky], dim=1)
+    ones = torch.ones_like(weights)[..., None]
+    regions = [(weights if sky is None else weights * ~sky.which, torch.cat([ones, codes], dim=-1))]
+    if sky is not None:
+        elevated = torch.cat([ones, elevation_powers(sky.sine)], dim=-1)
+        regions.append(((covered & sky.which).float(), elevated))
+    return torch.cat(_fitted(rendering.colors, photo, regions, training), dim=1)
 
 
 def changed_harmonics(
@@ -149,58 +127,56 @@ def split_change(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]
     return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)
 
 
-@torch.no_grad()
-def match_sky(
-    render: Float[Tensor, "H W 3"],
-    photo: Float[Tensor, "H W 3"],
-    weights: Float[Tensor, "H W"],
-    sine: Float[Tensor, "H W"],
-    training: bool = False,
-) -> Float[Tensor, "3 M"]:
-    """As `match_colors`, for the sky: the change may vary smoothly with the elevation.
-
-    Args:
-        render: In 0..1, more where the scene is brighter than white, less where it is below black.
-        photo: In 0..1.
-        weights: Of the pixels; 0 where there is no sky.
-        sine: Of the elevation at which a pixel shows the sky.
-        training: Whether each channel has a gain of its own and no share in the others.
-
-    Returns:
-        Change [A | b | E]: colours c become ``c + A c + b + E @ elevation_powers(sine)``.
-    """
-    further = torch.cat([torch.ones_like(sine)[..., None], elevation_powers(sine)], dim=-1)
-    return _fitted(render, photo, weights, further, training)
-
-
 def _fitted(
-    render: Tensor, photo: Tensor, weights: Tensor, further: Float[Tensor, "H W F"], training: bool
-) -> Float[Tensor, "3 M"]:
+    render: Float[Tensor, "*pixels 3"],
+    photo: Float[Tensor, "*pixels 3"],
+    regions: Sequence[tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels _"]]],
+    training: bool,
+) -> list[Float[Tensor, "3 _"]]:
     """Robust least squares of the photo's difference from the render by the render's colours and further terms.
 
     In training each channel has a gain of its own and no share in the others. With all nine numbers, training lost
     the colours of materials: errors of the render weaken what the fit makes of a hue, which then is not learnt.
 
-    Nothing in it waits for a GPU: pixels that do not count are weighted, not selected.
+    Nothing in it waits for a GPU: pixels that do not count are weighted, not selected. All regions, and channels
+    that have a gain of their own, are solved at once, in few operations, since each is small.
+
+    Args:
+        render: Colours.
+        photo: Likewise.
+        regions: Of each, the weights of pixels, and further terms, of which the first is 1.
+        training: Whether each channel has a gain of its own.
     """
-    counts = (weights > 0).reshape(-1)
-    base = torch.where(counts, weights.reshape(-1), 0).double()
-    colors = torch.where(counts[:, None], render.reshape(-1, 3).clamp(max=1), 0).double()
-    residual = torch.where(counts[:, None], photo.reshape(-1, 3), 0).double() - colors
-    further = further.reshape(len(colors), -1).double()
-    # A leading axis of problems: one of three channels, or one for each channel.
+    sizes = [further.shape[-1] for _, further in regions]
+    weights = torch.stack([weight.reshape(-1) for weight, _ in regions])
+    # A term that a region lacks is 0, and so is its coefficient.
+    padded = [functional.pad(further, (0, max(sizes) - further.shape[-1])) for _, further in regions]
+    further = torch.stack(padded).reshape(len(regions), 1, weights.shape[1], max(sizes))
+    colors = render.reshape(-1, 3).clamp(max=1)
+    residual = photo.reshape(-1, 3) - colors
+    # Axes: regions, sets of channels that are solved together, pixels, terms and residuals.
+    parts = (colors.T[..., None], residual.T[..., None]) if training else (colors[None], residual[None])
+    sets, own = parts[0].shape[0], parts[0].shape[2]
+    sides = (*further.shape[:1], sets, len(colors), -1)
+    columns = [parts[0].expand(sides), further.expand(sides), parts[1].expand(sides)]
+    counts = weights > 0
+    table = torch.where(counts[:, None, :, None], torch.cat(columns, dim=3), 0).double()
+    terms, residuals = table[..., :-own], table[..., -own:]
+    ridge = RIDGE * torch.eye(terms.shape[3], table.shape[3], dtype=table.dtype, device=table.device)
+    base = torch.where(counts, weights, 0).double()
+    change, trusted = table.new_zeros(()), base
+    for round_ in range(rounds := TRAINING_ROUNDS if training else ROUNDS):
+        sums = (terms * trusted[:, None, :, None]).mT @ table
+        # The term that is 1, squared and summed, is the sum of weights.
+        normal = torch.addcdiv(ridge, sums, sums[..., own : own + 1, own : own + 1])
+        change = torch.linalg.solve_ex(normal[..., :-own], normal[..., -own:]).result
+        if round_ < rounds - 1:
+            error = (residuals - terms @ change).abs().mean(dim=(1, 3))
+            trusted = base / (1 + (error / OUTLIER).square())
     if training:
-        terms = torch.cat([colors.T[..., None], further.expand(3, -1, -1)], dim=2)
-        residual = residual.T[..., None]
+        found = torch.cat([change[:, :, 0, 0].diag_embed(), change[:, :, 1:, 0]], dim=2)
     else:
-        terms, residual = torch.cat([colors, further], dim=1)[None], residual[None]
-    ridge = RIDGE * torch.eye(terms.shape[2], dtype=terms.dtype, device=terms.device)
-    change, trusted = terms.new_zeros(()), base
-    for _ in range(TRAINING_ROUNDS if training else ROUNDS):
-        weighted = terms.mT * (trusted / trusted.sum())
-        change = torch.linalg.solve_ex(weighted @ terms + ridge, weighted @ residual).result
-        error = (residual - terms @ change).abs().mean(dim=(0, 2))
-        trusted = base * OUTLIER**2 / (OUTLIER**2 + error.square())
-    found = torch.cat([change[:, 0, 0].diag(), change[:, 1:, 0]], dim=1) if training else change[0].T
-    usable = found.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
-    return torch.where(usable, found.float(), 0).contiguous()
+        found = change[:, 0].mT
+    usable = found.isfinite().flatten(1).all(dim=1) & (counts.sum(dim=1) >= LEAST_PIXELS)
+    found = torch.where(usable[:, None, None], found.float(), 0)
+    return [each[:, : 3 + size] for each, size in zip(found, sizes, strict=True)]

@@ -142,7 +142,6 @@ class Parsing(MixedModule):
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
         """
         networks = (self.encoder, self.decoder, self.mask_head, self.global_mlp)
-        # The few steps after an opacity reset, in which the mask does not learn, are not worth graphs of their own.
         function: Callable[..., tuple[Tensor, Tensor]]
         settings: tuple[Any, ...]
         if self.encoder.frozen:
@@ -150,10 +149,7 @@ class Parsing(MixedModule):
             function, image, settings = self._after_frozen, packed, (shapes, learn_mask)
         else:
             function, image, settings = self._networks, self.shrink(photo), (learn_encoder, learn_mask)
-        if learn_mask:
-            coarse, embedding = self.replays(function, networks, image, settings)
-        else:
-            coarse, embedding = function(image, *settings)
+        coarse, embedding = self.replays(function, networks, image, settings)
         logits = functional.interpolate(coarse, size=photo.shape[:2], mode="bilinear", align_corners=False)
         bounded = _Bounded.apply(logits[0, 0]) if self.config.bounded_logits else logits[0, 0]
         return bounded.sigmoid(), embedding

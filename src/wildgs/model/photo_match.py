@@ -23,12 +23,10 @@ from wildgs.model.color_match import (
 from wildgs.model.config import WildGSConfig
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.sky import Sky, find_sky
-from wildgs.rasterize import Projection, Rendering, blend
+from wildgs.rasterize import Projection, Rendering, blend, blend_sample
 
-MATCH_EVERY = 3
-"""Rows and columns of which one is read in training, where there are as many."""
-MATCH_TILES = 40
-"""Tiles of a training picture that are rendered for its match."""
+MATCH_TILES, MATCH_EVERY = 40, 3
+"""Tiles of a training picture that are rendered for its match, and their rows and columns of which one is read."""
 FIT_SIDE = 320
 """Pixels along the long side, at most, at which an encoded photo is matched: light is of low frequency."""
 
@@ -78,13 +76,13 @@ class Picture:
         rendering: Colours, depth and alpha.
         codes: The light codes in its pixels.
         sky: Which pixels show the sky; None for a scene without one.
-        pixels: Rows and columns of the photo that are there.
+        pixels: Rows and columns of the photo that are there; None for all.
     """
 
     rendering: Rendering
-    codes: Float[Tensor, "H W L"]
+    codes: Float[Tensor, "*pixels L"]
     sky: Sky | None
-    pixels: tuple[slice, slice]
+    pixels: tuple[Tensor, Tensor] | None
 
 
 class PhotoMatch(nn.Module):
@@ -139,15 +137,15 @@ class PhotoMatch(nn.Module):
             projection: Of the Gaussians.
             values: Their colours and light codes, side by side.
             centre: Of the scene.
-            training: Whether a sample is enough: of the tiles, and of their rows and columns.
+            training: Whether a sample of the pixels is enough.
         """
-        blended = blend(projection, values, sample_tiles=MATCH_TILES if training else None)
-        every = MATCH_EVERY if training else 1
-        rows, columns = (slice(min(every // 2, side - 1), None, every) for side in blended.alpha.shape)
-        pixels = (rows, columns)
-        colors, depth = blended.colors[pixels], blended.depth[pixels]
-        sky = self.sky(projection.camera.unproject(depth, pixels), centre)
-        return Picture(Rendering(colors[..., :3], depth, blended.alpha[pixels]), colors[..., 3:], sky, pixels)
+        if training:
+            blended, pixels = blend_sample(projection, values, tiles=MATCH_TILES, every=MATCH_EVERY)
+        else:
+            blended, pixels = blend(projection, values), None
+        colors, codes = blended.colors[..., :3], blended.colors[..., 3:]
+        sky = self.sky(projection.camera.unproject(blended.depth, pixels), centre)
+        return Picture(Rendering(colors, blended.depth, blended.alpha), codes, sky, pixels)
 
     def find(self, sight: Sight, picture: Picture, *, training: bool = False) -> Float[Tensor, "3 M"]:
         """The change that takes the colours of a picture to those of the photo, without gradient.
@@ -157,7 +155,7 @@ class PhotoMatch(nn.Module):
             picture: From its camera.
             training: Whether each channel has a gain of its own; see `match_photo`.
         """
-        pixels = picture.pixels
+        pixels = (...,) if picture.pixels is None else picture.pixels
         return match_photo(
             sight.photo[pixels],
             picture.rendering,

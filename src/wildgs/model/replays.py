@@ -22,9 +22,9 @@ from wildgs.errors import WildGSWarning
 
 EAGER_CALLS = 2
 """Calls of one shape before it is recorded: a shape that comes once is not worth it."""
-MOST_GRAPHS = 24
-"""Further shapes run without. Parsing has 13 shapes at most (`Parsing.shrink`); a ResNet encoder, which learns on
-some steps only, has each of them twice."""
+MOST_GRAPHS = 32
+"""Further ones run without. Parsing has 13 shapes at most (`Parsing.shrink`), each of them with and without a mask
+that learns; a ResNet encoder learns on the same steps as the mask does."""
 WARM_UP = 3
 """Passes before the capture, in which libraries choose their kernels and allocate their workspaces."""
 TOLERANCE = 0.05
@@ -72,6 +72,10 @@ class Replays:
         self._graphs.clear()
         self._memory = None
 
+    def records(self, x: Tensor) -> bool:
+        """Whether networks are recorded that take `x`."""
+        return self.on and x.is_cuda and torch.is_grad_enabled()
+
     def __call__(
         self, network: Network, modules: Sequence[nn.Module], x: Tensor, settings: tuple[Hashable, ...] = ()
     ) -> Outputs:
@@ -84,7 +88,7 @@ class Replays:
             x: Takes no gradient.
             settings: Further arguments; each combination is recorded by itself.
         """
-        if not (self.on and x.is_cuda and torch.is_grad_enabled()):
+        if not self.records(x):
             return network(x, *settings)
         key = (tuple(x.shape), *settings)
         if key in self._graphs:
@@ -207,7 +211,10 @@ class _Replay(torch.autograd.Function):
     def forward(ctx: Any, recording: Recording, x: Tensor, *inputs: Tensor) -> Outputs:
         ctx.recording = recording
         ctx.writes = len(inputs) == 1 and inputs[0] is recording._anchor
-        return recording.replay_forward(x)
+        outputs = recording.replay_forward(x)
+        fixed = [output for output, learns in zip(outputs, recording._learning, strict=True) if not learns]
+        ctx.mark_non_differentiable(*fixed)
+        return outputs
 
     @staticmethod
     @once_differentiable

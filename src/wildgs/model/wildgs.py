@@ -235,6 +235,8 @@ class WildGS(Method):
         appearance: Appearance,
         projection: Projection,
         keep: Bool[Tensor, "H W"] | None = None,
+        *,
+        learn: bool = True,
     ) -> Appearance:
         """3D Wrapping: adds the triplane, from depth that takes no gradient.
 
@@ -243,6 +245,7 @@ class WildGS(Method):
             appearance: From `parse`.
             projection: The Gaussians as the photo's camera sees them; only geometry is used.
             keep: The user's own mask: pixels that are False are not lifted.
+            learn: Whether gradients reach U^3D.
         """
         with torch.no_grad():
             geometry = blend(projection, None)
@@ -250,7 +253,8 @@ class WildGS(Method):
             if keep is not None:
                 chosen = chosen & keep
             points, colors = lift(photo, geometry.depth, projection.camera)
-        return replace(appearance, planes=self.wrapping.planes(points, colors, chosen.reshape(-1)))
+        planes = self.wrapping.planes(points, colors, chosen.reshape(-1), learn=learn)
+        return replace(appearance, planes=planes)
 
     def _lifted_in_training(
         self, photo: Float[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None
@@ -313,8 +317,8 @@ class WildGS(Method):
         projection = self.gaussians.project(camera, absgrad=stage.absgrad, factors=factors)
         projection.means2d.retain_grad()
         if stage.explicit and self._wraps:
-            with torch.set_grad_enabled(torch.is_grad_enabled() and stage.learn_planes):
-                appearance = self.wrap(photo, appearance, projection, self._lifted_in_training(photo, keep))
+            lifted = self._lifted_in_training(photo, keep)
+            appearance = self.wrap(photo, appearance, projection, lifted, learn=stage.learn_planes)
         rows = rows_to_shade(projection.visible)
         matched = bool(self.config.color_match and self.config.matched_loss)
         colors = self.paint_rows(rows, camera, appearance, stage.sh_degree, clamped=not matched)

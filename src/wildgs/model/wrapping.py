@@ -18,8 +18,8 @@ MIN_ALPHA = 0.5
 
 
 def liftable(
-    visibility: Float[Tensor, "H W"] | None, alpha: Float[Tensor, "H W"], threshold: float
-) -> Bool[Tensor, "H W"]:
+    visibility: Float[Tensor, "*pixels"] | None, alpha: Float[Tensor, "*pixels"], threshold: float
+) -> Bool[Tensor, "*pixels"]:
     """Pixels that may be lifted: static (M > Th) and covered by Gaussians."""
     covered = alpha > MIN_ALPHA
     return covered if visibility is None else covered & (visibility > threshold)
@@ -78,13 +78,20 @@ class Wrapping(MixedModule):
         points: Float[Tensor, "P 3"],
         colors: Float[Tensor, "P 3"],
         keep: Bool[Tensor, " P"] | None = None,
+        *,
+        learn: bool = True,
     ) -> Float[Tensor, "3 C R R"]:
-        """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates; see `project_cloud`."""
+        """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates; see `project_cloud`.
+
+        `learn` says whether gradients reach U^3D.
+        """
         pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution, keep)
         if not self.reverse:
             pictures = pictures[:, :1]
-        (planes,) = self.replays(self._networks, (self.unet,), pictures.flatten(1, 2))
-        return planes
+        # Only what could learn is recorded, and a replay keeps nothing that no backward pass asks for.
+        with torch.set_grad_enabled(torch.is_grad_enabled() and (learn or self.replays.records(pictures))):
+            (planes,) = self.replays(self._networks, (self.unet,), pictures.flatten(1, 2))
+        return planes if learn else planes.detach()
 
     def _networks(self, pictures: Float[Tensor, "3 I R R"]) -> tuple[Float[Tensor, "3 C R R"]]:
         with self.mixed(pictures.device):

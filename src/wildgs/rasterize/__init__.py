@@ -2,6 +2,7 @@
 
 from wildgs.rasterize.dispatch import (
     blend,
+    blend_sample,
     pick_backend,
     project,
     rasterize,
@@ -15,6 +16,7 @@ __all__ = [
     "Projection",
     "Rendering",
     "blend",
+    "blend_sample",
     "pick_backend",
     "project",
     "rasterize",

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from wildgs.devices import upload
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.gsplat_library import load_gsplat
-from wildgs.rasterize.interface import Projection, Rendering
+from wildgs.rasterize.interface import TILE, Projection, Rendering
 
-TILE = 16
 _LEAST_ALPHA = 1e-10
 
 
@@ -97,10 +98,22 @@ def _projection(
     return Projection(camera, means2d, depths, conics, opacities, radii, "cuda", tiles, total)
 
 
-def blend(
-    projection: Projection, colors: Float[Tensor, "N C"], background: Float[Tensor, "C"] | None, depth: bool
+def blend_tiles(
+    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
 ) -> Rendering:
-    """See `wildgs.rasterize.blend`."""
+    """Blends some of the tiles; in the others, gsplat leaves alpha unwritten."""
+    tiles = upload(torch.from_numpy(chosen[None]), colors.device)
+    return blend(projection, colors, None, True, tiles)
+
+
+def blend(
+    projection: Projection,
+    colors: Float[Tensor, "N C"],
+    background: Float[Tensor, "C"] | None,
+    depth: bool,
+    chosen: Bool[Tensor, "1 R S"] | None = None,
+) -> Rendering:
+    """See `wildgs.rasterize.blend`; `chosen` tiles alone are blended, None blends all."""
     camera, tiles = projection.camera, projection.tiles
     height, width, channels = camera.height, camera.width, colors.shape[1]
     if tiles is None:
@@ -117,7 +130,7 @@ def blend(
         _collect_absgrad(screen[0], projection.absgrad)
     sums, alpha = load_gsplat().rasterize_to_pixels(
         *screen, width, height, TILE, tiles.offsets, tiles.flatten_ids,
-        packed=False, absgrad=projection.absgrad is not None,
+        masks=chosen, packed=False, absgrad=projection.absgrad is not None,
     )  # fmt: skip
     sums, alpha = sums.reshape(height, width, -1), alpha.reshape(height, width)
     expected = sums[..., channels] / alpha.clamp(min=_LEAST_ALPHA) if depth else torch.zeros_like(alpha)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from wildgs.devices import upload
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import num_sh_bases
-from wildgs.rasterize.interface import EPS2D, BackendName, Projection, Rendering
+from wildgs.rasterize.interface import EPS2D, TILE, BackendName, Projection, Rendering
 
 
 def pick_backend(device: torch.device | str) -> BackendName:
@@ -104,7 +106,6 @@ def blend(
     *,
     background: Float[Tensor, "C"] | None = None,
     depth: bool = True,
-    sample_tiles: int | None = None,
 ) -> Rendering:
     """Blends values per Gaussian front to back over a projection's tile lists.
 
@@ -116,8 +117,6 @@ def blend(
         colors: Any number of channels per Gaussian; None for depth and alpha alone.
         background: Colour behind everything; black if None.
         depth: Whether to blend expected depth too.
-        sample_tiles: Blend about so many tiles, drawn at random and spread over the picture, without gradient:
-            enough for statistics of the picture. Alpha is 0 in the others. Backends that cannot blend all.
 
     Raises:
         ValueError: Shapes, devices or number types do not fit.
@@ -128,14 +127,45 @@ def blend(
     _check("colors", colors, (len(means2d), None), means2d, projection.backend)
     if background is not None:
         _check("background", background, (colors.shape[1],), means2d, projection.backend)
-    if sample_tiles is not None:
-        # Drawn for every backend, so that all of them leave the random state of a training the same.
-        place = float(torch.rand(()))
-        if projection.backend == "cpu":
-            from wildgs.rasterize.cpu import blend_sample
-
-            return blend_sample(projection, colors, background, depth, sample_tiles, place)
     return _module(projection.backend).blend(projection, colors, background, depth)
+
+
+@torch.no_grad()
+def blend_sample(
+    projection: Projection, colors: Float[Tensor, "N C"], *, tiles: int, every: int
+) -> tuple[Rendering, tuple[Int[Tensor, " P"], Int[Tensor, " P"]]]:
+    """Blends pixels spread over a picture, enough for statistics of it, without gradient and without background.
+
+    Only the tiles in which they lie are blended. Torch's random state draws which.
+
+    Args:
+        projection: From `project`.
+        colors: Any number of channels per Gaussian.
+        tiles: About how many tiles.
+        every: One of so many rows and columns of a tile.
+
+    Returns:
+        The rendering of P pixels, and their rows and columns.
+
+    Raises:
+        ValueError: Shapes, devices or number types do not fit.
+    """
+    means2d, camera = projection.means2d, projection.camera
+    _check("colors", colors, (len(means2d), None), means2d, projection.backend)
+    lines, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+    step = max(1, lines * columns // tiles)
+    # Diagonals of tiles, which no row or column of the picture escapes.
+    diagonal = np.add.outer(np.arange(lines), np.arange(columns)) + int(float(torch.rand(())) * step)
+    chosen = diagonal % step == 0
+    corners = TILE * np.argwhere(chosen)[:, None]
+    offsets = np.arange(every // 2, TILE, every)
+    inside = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1).reshape(1, -1, 2)
+    pixels = (corners + inside).reshape(-1, 2)
+    pixels = pixels[(pixels < (camera.height, camera.width)).all(axis=1)]
+    picture = _module(projection.backend).blend_tiles(projection, colors, chosen)
+    at = upload(torch.from_numpy(pixels.T.copy()), means2d.device)
+    pictures = (picture.colors, picture.depth, picture.alpha)
+    return Rendering(*(values[at[0], at[1]] for values in pictures)), (at[0], at[1])
 
 
 def sh_to_colors(

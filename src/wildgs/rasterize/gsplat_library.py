@@ -36,7 +36,7 @@ _CALLS = {
     "rasterize_to_pixels": (
         ("means2d", "conics", "colors", "opacities", "image_width", "image_height", "tile_size")
         + ("isect_offsets", "flatten_ids"),
-        ("packed", "absgrad"),
+        ("masks", "packed", "absgrad"),
     ),
     "spherical_harmonics": (("degrees_to_use", "dirs", "coeffs"), ("masks",)),
 }

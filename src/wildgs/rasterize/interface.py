@@ -16,6 +16,7 @@ from wildgs.geometry.camera import Camera
 
 BackendName = Literal["cpu", "cuda", "reference"]
 
+TILE = 16  # pixels along a tile's side
 EPS2D = 0.3  # px^2 added to the 2D covariance's diagonal, gsplat's default: nothing is thinner than a pixel
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is dropped at a pixel where its alpha is below
 MAX_ALPHA = 0.999
@@ -59,7 +60,7 @@ class Projection:
 
 @dataclass
 class Rendering:
-    """A blended picture.
+    """A blended picture, or some pixels of one.
 
     Attributes:
         colors: Σ c_i α'_i T_i (+ background · (1 - alpha)).
@@ -68,9 +69,9 @@ class Rendering:
         alpha: Σ α'_i T_i in [0, 1].
     """
 
-    colors: Float[Tensor, "H W C"]
-    depth: Float[Tensor, "H W"]
-    alpha: Float[Tensor, "H W"]
+    colors: Float[Tensor, "*pixels C"]
+    depth: Float[Tensor, "*pixels"]
+    alpha: Float[Tensor, "*pixels"]
 
     def detached(self) -> Rendering:
         """The same picture without its autograd graph."""

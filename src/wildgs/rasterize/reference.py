@@ -5,8 +5,9 @@ Other backends are held to this one. Semantics are gsplat's classic mode (versio
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -117,6 +118,13 @@ def blend(
         depth=expected.reshape(shape) if depth else expected.new_zeros(()).expand(shape),
         alpha=alpha.reshape(shape),
     )
+
+
+def blend_tiles(
+    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
+) -> Rendering:
+    """Blends all tiles, the chosen among them."""
+    return blend(projection, colors, None, True)
 
 
 def _blend_pixels(

@@ -17,6 +17,7 @@ from PIL import Image
 from wildgs.errors import UserError
 from wildgs.files import written_aside
 from wildgs.progress import Counter, in_threads
+from wildgs.scene.capture import carry_capture
 from wildgs.scene.image_cache import DECODERS, ImageCache
 from wildgs.scene.images import Photo, UnreadableImageError, read_mask, read_photo
 from wildgs.scene.photo_store import PhotoStore
@@ -59,7 +60,7 @@ def carry_scene(folder: Path, scene: Scene, progress: Counter | None = None) -> 
             photo = view.photos.get(view.name)
         except UserError:  # gone since it was first read; training continues without it, too
             return
-        _write_photo(lights, number, photo, side)
+        _write_photo(lights, number, photo, side, view.photos.file(view.name))
 
     for _ in in_threads(write, list(enumerate(scene.views)), DECODERS, progress):
         pass
@@ -73,7 +74,7 @@ def carried_side(sizes: Sequence[tuple[int, int]]) -> int:
     return max(MIN_SIDE, min(MAX_SIDE, within_total))
 
 
-def _write_photo(lights: Path, number: int, photo: Photo, side: int) -> None:
+def _write_photo(lights: Path, number: int, photo: Photo, side: int, original: Path | None) -> None:
     height, width = photo.pixels.shape[:2]
     shrink = min(1.0, side / max(width, height))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
@@ -81,6 +82,8 @@ def _write_photo(lights: Path, number: int, photo: Photo, side: int) -> None:
     with written_aside(_photo_file(lights, number)) as aside:
         small = image if size == image.size else image.resize(size, Image.Resampling.LANCZOS)
         small.save(aside, "JPEG", quality=QUALITY, subsampling=0)
+        if original is not None:
+            carry_capture(original, aside)
     if photo.mask is not None:
         mask = np.array(Image.fromarray(photo.mask).resize(size, Image.Resampling.BOX)) > 127
         with written_aside(_mask_file(lights, number)) as aside:
@@ -133,6 +136,10 @@ class CarriedPhotos(PhotoStore):
     def get(self, name: str) -> Photo:
         """See `PhotoStore.get`."""
         return self._cache.get(name, lambda: self._decode(name))
+
+    def file(self, name: str) -> Path:
+        """See `PhotoStore.file`."""
+        return _photo_file(self._folder, self._numbers[name])
 
     def prefetch(self, name: str) -> None:
         """See `PhotoStore.prefetch`."""

@@ -89,6 +89,10 @@ class PhotoStore(ABC):
         """What tells a photo's files from others, by what they are; empty where there are no files."""
         return {}
 
+    def file(self, name: str) -> Path | None:
+        """The file of a photo; None for stores without files."""
+        return None
+
     def prefetch(self, name: str) -> None:  # noqa: B027 - stores that need no preparation do nothing
         """Announces that a photo is needed soon, so that it can be decoded in the background."""
 
@@ -187,6 +191,10 @@ class ScenePhotos(PhotoStore):
             "metric depth": metric_file(self._depth[name]) if self.use_depth else None,
         }
         return {what: digest for what, file in files.items() if file and (digest := fingerprint(file))}
+
+    def file(self, name: str) -> Path:
+        """See `PhotoStore.file`."""
+        return self.images_dir / name
 
     def prefetch(self, name: str) -> None:
         """See `PhotoStore.prefetch`."""

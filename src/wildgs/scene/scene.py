@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from wildgs.devices import upload
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.scene.photo_store import PhotoStore
@@ -144,16 +145,6 @@ class View:
 def to_unit(pixels: UInt8[Tensor, "H W 3"], device: torch.device) -> Float[Tensor, "H W 3"]:
     """8-bit RGB as floats in [0, 1] on a device."""
     return upload(pixels, device).float() / 255
-
-
-def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor in main memory, on a device.
-
-    To a GPU it is copied from pinned memory: a copy from pageable memory waits for all work queued before.
-    """
-    if device.type == "cuda":
-        return tensor.pin_memory().to(device, non_blocking=True)
-    return tensor.to(device)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from PIL import Image
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.processes import signals_as_interrupts
 from wildgs.progress import Progress, silent
+from wildgs.scene.capture import carry_capture
 from wildgs.scene.colmap import LAYOUTS
 from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
@@ -276,6 +277,7 @@ def _write_scene(work: Workplace, copies: Sequence[WorkingCopy], model: Any) -> 
         image.name = copy.scene_name
         target = work.scene / "images" / copy.scene_name
         target.parent.mkdir(parents=True, exist_ok=True)
+        carry_capture(work.images / copy.work_name, dense / "images" / copy.work_name)
         (dense / "images" / copy.work_name).rename(target)
         if copy.masked:
             _write_mask(work, copy, original.camera)

@@ -1,7 +1,7 @@
 """The CPU backend: Numba kernels behind the three functions of the rasteriser's interface."""
 
-from wildgs.rasterize.cpu.blending import blend, blend_sample
+from wildgs.rasterize.cpu.blending import blend, blend_tiles
 from wildgs.rasterize.cpu.projection import project
 from wildgs.rasterize.cpu.shading import sh_to_colors
 
-__all__ = ["blend", "blend_sample", "project", "sh_to_colors"]
+__all__ = ["blend", "blend_tiles", "project", "sh_to_colors"]

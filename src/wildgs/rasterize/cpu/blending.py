@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.rasterize.cpu import backward_kernels, forward_kernels, tile_kernels
@@ -130,22 +130,11 @@ def blend(
     return Rendering(*pictures)  # type: ignore[misc]
 
 
-@torch.no_grad()
-def blend_sample(
-    projection: Projection,
-    colors: Float[Tensor, "N C"],
-    background: Float[Tensor, "C"] | None,
-    depth: bool,
-    count: int,
-    place: float,
+def blend_tiles(
+    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
 ) -> Rendering:
-    """Blends about `count` tiles spread over the picture, chosen by `place` in [0, 1); alpha is 0 in the others."""
-    if background is None:
-        background = colors.new_zeros(colors.shape[1])
+    """Blends some of the tiles; the picture is 0 in the others."""
     order: np.ndarray = projection.tiles.tile_order
-    columns = -(-projection.camera.width // TILE)
-    step = max(1, len(order) // count)
-    # Diagonals of tiles, which no row or column of the picture escapes.
-    diagonal = order // columns + order % columns + int(place * step)
-    chosen = order[diagonal % step == 0]
-    return Rendering(*_blend_pictures(projection, colors, background, depth, False, chosen)[:3])
+    background = colors.new_zeros(colors.shape[1])
+    order = order[chosen.reshape(-1)[order]]
+    return Rendering(*_blend_pictures(projection, colors, background, True, False, order)[:3])

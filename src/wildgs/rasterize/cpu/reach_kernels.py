@@ -9,8 +9,8 @@ import numpy as np
 
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.simd import fma, lane_x, lane_y, mask_bits, vmax, vmin
+from wildgs.rasterize.interface import TILE
 
-TILE = 16
 # Floats per Gaussian: x, y, A, B, C, level, -B / 2C, -B / 2A, with log2 alpha = A dx^2 + B dx dy + C dy^2 + level.
 RECORD = 8
 MIN_LEVEL = np.float32(-7.99435344)  # log2(1/255)
