@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from wildgs.devices import upload
 from wildgs.engine.density.control import DensityControl, DensityReport, SeenView, ViewStatistics
 from wildgs.engine.optimizers import edit_rows
 from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
-from wildgs.scene.scene import upload
 
 SPLIT_INTO = 2
 SPLIT_SHRINK = 1.6
