@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
-from wildgs.files import written_aside
+from wildgs.files import read_json, written_aside
 from wildgs.library.benchmark_plan import (
     PHOTOTOURISM_DOWNSCALE,
     Job,
@@ -300,7 +299,7 @@ class _Bench:
 def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
     """The scores of a run; None if there are none, or they cannot be read."""
     try:
-        content = json.loads((folder / "eval" / protocol / "metrics.json").read_text(encoding="utf-8"))
+        content = read_json(folder / "eval" / protocol / "metrics.json")
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) and "step" in content and "mean" in content else None

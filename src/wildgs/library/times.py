@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from wildgs.errors import UserError
+from wildgs.files import is_file
 from wildgs.library.loaded import LoadedScene
 from wildgs.light.captures import Capture, read_capture
 from wildgs.scene.colmap import find_model
+from wildgs.scene.photo_store import with_ending
 
 
 def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, Capture]:
@@ -14,16 +17,36 @@ def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, 
 
     Args:
         loaded: The run.
-        photos: Folder of the original photos; None looks in the scene folder of the run. Undistorted photos of
-            `wildgs sfm` have no EXIF blocks.
+        photos: Folder of the original photos, whose endings may differ from those of the scene; None looks in the
+            scene folder of the run. Undistorted photos of `wildgs sfm` have no EXIF blocks.
+
+    Raises:
+        UserError: There is no folder `photos`.
     """
-    if photos is None:
+    names = [view.name for view in loaded.views]
+    if photos is not None:
+        files = _by_stem(photos)
+        found = {name: files[stem] for name in names if (stem := with_ending(name, "")) in files}
+        found |= {name: photos / name for name in names if is_file(photos / name)}
+    else:
         try:
-            photos = find_model(Path(loaded.run.config.scene))[1]
+            folder = find_model(Path(loaded.run.config.scene))[1]
         except Exception:  # a run works without its scene folder
             return {}
-    found = {view.name: read_capture(photos / view.name) for view in loaded.views}
-    return {name: capture for name, capture in found.items() if capture is not None}
+        found = {name: folder / name for name in names}
+    captures = {name: read_capture(file) for name, file in found.items()}
+    return {name: capture for name, capture in captures.items() if capture is not None}
+
+
+def _by_stem(photos: Path) -> dict[str, Path]:
+    """The files of a folder by their path in it without ending."""
+    if not photos.is_dir():
+        raise UserError(f"{photos}: no such folder; give the folder of the original photos")
+    return {
+        with_ending(path.relative_to(photos).as_posix(), ""): path
+        for path in sorted(photos.rglob("*"))
+        if is_file(path)
+    }
 
 
 def read_times(loaded: LoadedScene) -> dict[str, str]:

@@ -15,9 +15,10 @@ import filelock
 import pycolmap
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import is_file, written_aside
+from wildgs.files import is_file, read_json, written_aside
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.upright import WorkingCopy, list_photos
+from wildgs.version import __version__
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ class Workplace:
     def load_copies(self) -> tuple[list[WorkingCopy], dict[str, str]] | None:
         """The copies of an interrupted reconstruction, None where they are not complete."""
         try:
-            record = json.loads((self.root / "copies.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            record = read_json(self.root / "copies.json")
+            copies = [
+                WorkingCopy(**{**copy, "position": copy["position"] and tuple(copy["position"])})
+                for copy in record["copies"]
+            ]
+            return copies, record["broken"]
+        except (OSError, ValueError, TypeError, KeyError):
             return None
-        copies = [
-            WorkingCopy(**{**copy, "position": copy["position"] and tuple(copy["position"])})
-            for copy in record["copies"]
-        ]
-        return copies, record["broken"]
 
     def is_done(self, stage: str) -> bool:
         """Whether a stage was finished, by this call or an interrupted one."""
@@ -145,7 +146,7 @@ def _read(file: Path) -> str | None:
 
 def _plan(photos: Path, config: SfmConfig) -> str:
     """What the work depends on: options, pycolmap, and name, size and time of every photo."""
-    digest = hashlib.sha256(f"{pycolmap.__version__} {config}".encode())
+    digest = hashlib.sha256(f"{__version__} {pycolmap.__version__} {config}".encode())
     for name in list_photos(photos):
         stat = (photos / name).stat()
         digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\0".encode(errors="surrogateescape"))
