@@ -548,8 +548,8 @@ def test_what_metric_depth_may_hold(make_scene: MakeScene, tmp_path: Path) -> No
     Image.fromarray(values).save(root / "depth/p01.tiff")
     Image.fromarray(np.full((H, W), 9, np.uint16)).save(root / "depth/p02.tiff")
     Image.fromarray(values[:, :9]).save(root / "depth/p03.tiff")
-    (root / "depth/p04.tiff").write_bytes(b"II*\0" + bytes(40))
-    os.truncate(root / "depth/p05.tiff", 100)
+    (root / "depth/p04.tiff").write_bytes(b"no picture")
+    (root / "depth/p05.tiff").write_bytes(b"")
     with pytest.warns(WildGSWarning) as said:
         loaded = load_scene(root, DataConfig(holdout=0))
     assert len(said) == 4

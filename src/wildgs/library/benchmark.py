@@ -23,7 +23,7 @@ from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
-from wildgs.files import read_json, written_aside
+from wildgs.files import check_regular, read_json, written_aside
 from wildgs.library.benchmark_plan import (
     PHOTOTOURISM_DOWNSCALE,
     Job,
@@ -201,6 +201,7 @@ class _Bench:
         """Why a job failed since this bench began, in any process; None if it did not."""
         file = job.folder / FAILURE_FILE
         try:
+            check_regular(file)
             return file.read_text(encoding="utf-8") if file.stat().st_mtime >= self._began else None
         except OSError:
             return None

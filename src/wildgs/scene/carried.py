@@ -112,7 +112,7 @@ def read_carried_scene(folder: Path) -> Scene | None:
     Raises:
         UserError: The file cannot be read.
     """
-    if not (folder / SCENE_FILE).is_file():
+    if not is_there(folder / SCENE_FILE):
         return None
     record = SceneRecord.read(folder / SCENE_FILE)
     return record.scene(folder, CarriedPhotos(folder / LIGHTS_FOLDER, record))
