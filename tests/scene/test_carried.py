@@ -164,6 +164,7 @@ def test_a_record_cut_short_is_one_line(scene: Scene, tmp_path: Path, keep: int)
         {"K": torch.zeros(9, 3, 3)},
         {"viewmats": torch.full((9, 4, 4), float("nan"))},
         {"sizes": torch.zeros(9, 2, dtype=torch.int32)},
+        {"alignment": replace(Alignment.identity(), scale=float("nan"))},
         {"sizes": torch.full((9, 2), 10**6, dtype=torch.int32)},
     ],
 )

@@ -33,7 +33,7 @@ from wildgs.library.benchmark_plan import (
     parse_variant,
 )
 from wildgs.library.config import Suite, default_bench_methods, reference_preset
-from wildgs.library.evaluation import PROTOCOLS, evaluate
+from wildgs.library.evaluation import PROTOCOLS, check_lpips, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.training import read_scene, train
 from wildgs.progress import Progress
@@ -116,6 +116,7 @@ def benchmark(
     Raises:
         UserError: Something that was asked for does not exist, or the output holds other runs.
     """
+    check_lpips(lpips)
     lpips, execution = None if lpips is None else Path(lpips), execution or ExecutionConfig()
     announce = announce or logger.info
     request = _Request(Path(output), suite, variants, lpips, execution, progress, observers, announce)

@@ -97,8 +97,9 @@ class Run:
         root = root or self.config.scene
         if not root.is_dir():
             raise UserError(
-                f"{root}: no such folder; {self.folder} was trained on the photos there: "
-                "give the folder where they are now by --scene"
+                f"{root}: no such folder; {self.folder} was trained on the photos there: give `wildgs eval` the "
+                "folder where they are now by --scene; a run of an earlier version carries them once it is resumed "
+                f"(`wildgs train SCENE --output {self.folder} --resume`)"
             )
         return root
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -151,6 +152,12 @@ class SceneRecord:
             raise ValueError("an observation is of no photo or point")
         if not all(bool(getattr(self, name).isfinite().all()) for name in ("viewmats", "K", "points")):
             raise ValueError("a camera or point is not finite")
+        turn, shift = self.alignment.rotation, self.alignment.translation
+        if (
+            not bool(turn.isfinite().all() and shift.isfinite().all())
+            or not 0 < self.alignment.scale < math.inf
+        ):
+            raise ValueError("its alignment is none")
         if bool((self.sizes < 1).any()) or bool((self.K[:, [0, 1], [0, 1]] <= 0).any()):
             raise ValueError("a camera has no size or focal length")
         if bool((self.sizes.long().prod(dim=1) > MAX_CAMERA_PIXELS).any()):
