@@ -134,6 +134,8 @@ def _exif(folder: Path) -> list[str]:
     camera, gps = exif.get_ifd(0x8769), exif.get_ifd(0x8825)
     camera[0xA405], camera[0x920A], camera[0xA20E], camera[0xA210] = 35, 24.0, 3000.0, 2
     gps[1], gps[2], gps[3], gps[4], gps[6] = "N", (48.0, 53.0, 12.0), "E", (2.0, 20.0, 35.0), 130.0
+    gps[7], gps[29] = (17.0, 30.0, 0.0), "2019:07:01"
+    camera[0x9003], camera[0x9011] = "2019:07:01 19:30:00", "+02:00"
     photo.save(folder / "photo.jpg", exif=exif)
     return ["photo.jpg"]
 
@@ -162,13 +164,15 @@ def _pictures(folder: Path) -> list[str]:
         colours.save(folder / f"photo.{ending}", **extra)
         files.append(f"photo.{ending}")
     Image.fromarray(rng.integers(0, 65535, (16, 24), dtype=np.uint16)).save(folder / "deep.png")
-    Image.fromarray(rng.random((16, 24), dtype=np.float32)).save(folder / "float.tif")
+    depth = Image.fromarray(rng.random((16, 24), dtype=np.float32))
+    depth.save(folder / "float.tif")
+    depth.save(folder / "depth.tiff", compression="tiff_deflate")
     colours.convert("RGBA").save(folder / "alpha.png")
-    return [*files, "deep.png", "float.tif", "alpha.png"]
+    return [*files, "deep.png", "float.tif", "depth.tiff", "alpha.png"]
 
 
 def _read_pictures(folder: Path) -> object:
-    from wildgs.scene.images import read_disparity, read_mask, read_photo
+    from wildgs.scene.images import read_depth, read_disparity, read_mask, read_photo
 
     limit = 10_000_000
     for path in folder.iterdir():
@@ -176,6 +180,7 @@ def _read_pictures(folder: Path) -> object:
             lambda path: read_photo(path, size=(12, 8), max_pixels=limit),
             lambda path: read_mask(path, (12, 8), limit),
             lambda path: read_disparity(path, (12, 8), limit),
+            lambda path: read_depth(path, (12, 8), limit),
         ):
             _tolerate(lambda read=read, path=path: read(path))
     return None
@@ -286,12 +291,46 @@ def _read_cameras(folder: Path) -> object:
     return read_camera_path(folder / "ours.json"), read_camera_path(folder / "theirs.json")
 
 
+def _carried(folder: Path) -> list[str]:
+    """What a run folder carries of its scene."""
+    import torch
+
+    from wildgs.geometry.camera import Camera
+    from wildgs.scene.carried import SCENE_FILE, carry_scene
+    from wildgs.scene.images import Photo
+    from wildgs.scene.photo_store import PhotoStore
+    from wildgs.scene.scene import Alignment, Scene, View
+
+    class Store(PhotoStore):
+        def get(self, name: str) -> Photo:
+            pixels = np.random.default_rng(len(name)).integers(0, 255, (32, 48, 3), dtype=np.uint8)
+            return Photo(pixels, np.eye(32, 48, dtype=np.uint8) * 255)
+
+    camera = Camera(torch.eye(4), torch.tensor([[30.0, 0, 24], [0, 30, 16], [0, 0, 1]]), 48, 32)
+    views = tuple(View(name, camera, "train", Store()) for name in ("a.jpg", "ü b.jpg"))
+    colors = torch.full((9, 3), 128, dtype=torch.uint8)
+    carry_scene(folder, Scene(folder, views, torch.rand(9, 3), colors, Alignment.identity()))
+    return [SCENE_FILE, *(f"lights/{path.name}" for path in (folder / "lights").iterdir())]
+
+
+def _read_carried(folder: Path) -> object:
+    from wildgs.scene.carried import read_carried_scene
+
+    scene = read_carried_scene(folder)
+    assert scene is not None
+    return [(view.read_photo(), view.read_mask()) for view in scene.views]
+
+
 def _read_exif(folder: Path) -> object:
-    """As `wildgs sfm`, the viewer's uploads and `load_scene` read photos."""
+    """As `wildgs sfm`, the viewer's uploads, `load_scene` and the order of a day read photos."""
+    from wildgs.light.captures import read_capture
+    from wildgs.light.sun import phase_of
     from wildgs.scene.images import read_photo
     from wildgs.sfm.upright import copy_upright
 
     _tolerate(lambda: read_photo(folder / "photo.jpg", max_pixels=10_000_000))
+    capture = read_capture(folder / "photo.jpg")
+    assert capture is None or np.isfinite(phase_of(capture, (48.0, 2.0)))
     (folder / "p").mkdir(exist_ok=True)
     shutil.copyfile(folder / "photo.jpg", folder / "p" / "photo.jpg")
     return copy_upright(folder / "p", folder / "copies", folder / "masks", max_pixels=10_000_000)
@@ -312,7 +351,10 @@ def _read_names(folder: Path) -> object:
     lines = (folder / "names").read_bytes().replace(b"\0", b"").split(b"\n")
     paths = [Path(os.fsdecode(line[:4000])) for line in lines]
     names = [
-        path.as_posix() for path in paths if path.name and not path.is_absolute() and ".." not in path.parts
+        path.as_posix()
+        for path in paths
+        # As `list_photos` finds them: no hidden files.
+        if path.name and not path.is_absolute() and not any(part.startswith(".") for part in path.parts)
     ]
     for name in names:
         printable(name).encode()
@@ -381,6 +423,7 @@ READERS = {
     "checkpoints": Reader(_checkpoints, _read_checkpoints),
     "appearance": Reader(_appearance, _read_appearance),
     "camera files": Reader(_cameras, _read_cameras),
+    "carried scene": Reader(_carried, _read_carried),
 }
 PYCOLMAP = {
     "pycolmap binary": Reader(_scene("bin"), _read_pycolmap),
@@ -458,6 +501,8 @@ def _work(name: str, folder: Path, command: Command, pipe: Connection, seed: int
             refused = name in PYCOLMAP and not isinstance(error, MemoryError)
             outcome = "refused" if refused else f"{type(error).__name__}: {str(error)[:100]}"
         signal.setitimer(signal.ITIMER_PROF, 0)
+        if outcome not in ("read", "refused"):
+            shutil.copyfile(pristine / file, folder / "found")
         pipe.send(("done", outcome))
         (pristine / file).write_bytes(contents[file])
 
@@ -521,10 +566,10 @@ def _keep(name: str, folder: Path, file: str, outcome: str, counts: Counter[str]
     counts[outcome] += 1
     if counts[outcome] == 1:
         command.findings.mkdir(parents=True, exist_ok=True)
-        source = folder / "pristine" / file
-        target = command.findings / f"{name} {len(counts)} {source.name}"
-        if source.is_file():
-            shutil.copyfile(source, target)
+        found = folder / "found"
+        source = found if found.is_file() else folder / "pristine" / file  # of a child that was killed
+        shutil.copyfile(source, command.findings / f"{name} {len(counts)} {Path(file).name}")
+        found.unlink(missing_ok=True)
 
 
 def _cpu_seconds(pid: int | None) -> float:

@@ -68,7 +68,10 @@ def test_what_is_left_out_and_its_cost_are_printed(wildgs, trained: Path, tmp_pa
     ("arguments", "message"),
     [
         (["--appearance", "nobody.jpg"], "nobody.jpg"),
-        (["--format", "ply", "--min-opacity", "2"], "leave no Gaussian"),
+        (["--format", "ply", "--min-opacity", "1"], "leave no Gaussian"),
+        (["--min-opacity", "2"], "--min-opacity 2.0: must be from 0 to 1"),
+        (["--crop", "nan"], "--crop nan"),
+        (["--sh-degree", "7"], "--sh-degree 7"),
     ],
 )
 def test_mistakes_are_one_line(wildgs, trained: Path, tmp_path: Path, capsys, arguments, message) -> None:

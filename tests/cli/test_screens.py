@@ -13,6 +13,7 @@ import pytest
 
 from wildgs.cli import screen
 from wildgs.engine.checkpoint import list_checkpoints
+from wildgs.files import written_aside
 from wildgs.runs import load_run
 
 SOURCE = Path(__file__).parents[2] / "src"
@@ -79,6 +80,25 @@ def test_nohup_is_respected(landmark: Path, tmp_path: Path) -> None:
     process.send_signal(signal.SIGHUP)
     assert process.wait() == 0
     assert trained_steps(run) == 30
+
+
+def test_sigterm_ends_every_verb_in_one_line(
+    wildgs, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """pycolmap, which comes with the scene, would print a C++ stack and leave temporary files."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def work(_: object) -> None:
+        assert "pycolmap" in sys.modules
+        assert signal.getsignal(signal.SIGTERM) not in (before, signal.SIG_DFL)
+        with written_aside(tmp_path / "file"):
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("wildgs.cli.gallery.run", work)
+    assert wildgs("gallery", tmp_path, "--output", tmp_path / "g.png") == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "terminated\n"
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_names_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:

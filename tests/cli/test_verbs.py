@@ -85,6 +85,10 @@ MISTAKES = {
     "not a run": (("eval", "{tmp}"), "not a run folder"),
     "run exists": (("train", "{landmark}", "--output", "{trained}"), "already holds a run"),
     "nothing to resume": (("train", "{landmark}", "--output", "{tmp}/new", "--resume"), "config.yaml"),
+    "no LPIPS weights": (
+        ("eval", "{trained}", "--lpips", "{tmp}/nowhere"),
+        "no such folder; leave it out",
+    ),
     "unknown photo": (
         ("render", "{trained}", "--appearance", "x.jpg", "--output", "{tmp}/o"),
         "neither a photo",

@@ -14,6 +14,7 @@ from wildgs.engine.checkpoint import (
     DamagedCheckpointError,
     list_checkpoints,
     load_checkpoint,
+    load_header,
     load_newest,
     save_checkpoint,
 )
@@ -192,3 +193,11 @@ def test_a_checkpoint_has_the_permissions_of_any_new_file(tmp_path: Path) -> Non
     other = tmp_path / "other"
     other.write_bytes(b"")
     assert path.stat().st_mode == other.stat().st_mode
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_pipe_in_the_place_of_a_checkpoint_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "step_00000003.safetensors")
+    with pytest.raises(UserError, match="not a regular file"):
+        load_newest(tmp_path)
+    assert load_header(tmp_path / "step_00000003.safetensors") == {}

@@ -187,6 +187,21 @@ def test_files_stand_upright_and_lead_back_to_the_input(splats: Splats, aligned:
         torch.testing.assert_close(moved.scales, splats.to_input_frame(alignment).scales)
 
 
+def test_variants_of_photos_with_like_names_are_kept_apart() -> None:
+    """Of two variants of one name, the first light would be lost."""
+    pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed")
+    names = usd.variant_names(usd._modules(), ["a_2.jpg", "a.jpg", "a.png", "a 2.jpg", "caf\udce9.jpg"])
+    assert len(set(names)) == 5
+    assert names[:3] == ["a_2", "a", "a_3"]
+
+
+def test_names_that_are_not_utf8_are_valid_json(splats: Splats) -> None:
+    scene = _scene(splats, 1)
+    scene = replace(scene, lights=[replace(scene.lights[0], name="caf\udce9\n.jpg")])
+    glb = Glb(glb_bytes(scene, _shared(scene, 1.0)))
+    assert glb.json["scenes"][0]["name"] == "caf\\xe9\\n.jpg"
+
+
 def test_usd_core_reads_every_light_of_the_variant_set(splats: Splats, tmp_path: Path) -> None:
     pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed")
     from pxr import Usd, UsdValidation, UsdVol

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,9 +15,12 @@ from PIL.ExifTags import IFD, Base
 
 import wildgs
 from wildgs.errors import UserError
+from wildgs.library import day as day_module
 from wildgs.library.config import TrajectoryOptions
 from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day
 from wildgs.library.times import read_captures
+from wildgs.light.captures import Capture
+from wildgs.light.day import plan_day
 from wildgs.scene.capture import carry_capture
 
 
@@ -70,6 +74,51 @@ def test_a_run_without_its_scene_knows_the_times(run: Path, tmp_path: Path) -> N
     Image.new("RGB", (8, 6)).save(tmp_path / "timed.jpg", exif=exif)
     carry_capture(tmp_path / "timed.jpg", loaded.views[3].photos.file(name))
     assert {name: capture.local.hour for name, capture in read_captures(loaded).items()} == {name: 17}
+
+
+def test_times_that_were_corrected_give_another_day(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many photos with a time, and other times: the day of the wrong clock is not shown again."""
+    scene, hours = wildgs.load(run), [9]
+
+    def captures(*_: object) -> dict[str, Capture]:
+        return {view.name: Capture(datetime(2020, 5, 1, hours[0])) for view in scene.views}
+
+    monkeypatch.setattr(day_module, "read_captures", captures)
+    made: list[object] = []
+    monkeypatch.setattr(day_module, "plan_day", lambda *given: made.append(given) or plan_day(*given))
+    for hour, count in ((9, 1), (9, 1), (10, 2)):
+        hours[0] = hour
+        find_day(scene)
+        assert len(made) == count
+    monkeypatch.undo()
+    (run / DAY_FILE).unlink()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"keys": []}, {"keys": ["nobody.jpg"]}, {"phases": {"nobody.jpg": 1.0}}, {"left_out": 3}, {"more": 1}],
+)
+def test_a_damaged_day_is_found_again(run: Path, change: dict) -> None:
+    scene = wildgs.load(run)
+    find_day(scene)
+    content = json.loads((run / DAY_FILE).read_text(encoding="utf-8"))
+    (run / DAY_FILE).write_text(json.dumps(content | change), encoding="utf-8")
+    assert known_day(scene) is None
+
+
+def test_original_photos_that_are_not_there_are_named(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no such folder; give the folder of the original photos"):
+        wildgs.render(run, tmp_path / "frames", over="day", photos=tmp_path / "nowhere")
+    with pytest.raises(UserError, match="--photos tells the hours"):
+        wildgs.render(run, tmp_path / "frames", photos=tmp_path)
+
+
+def test_original_photos_may_have_other_endings(run: Path, tmp_path: Path) -> None:
+    scene = wildgs.load(run)
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2020:05:01 06:00:00"
+    Image.new("RGB", (8, 6)).save(tmp_path / f"{Path(scene.views[0].name).stem}.webp", exif=exif)
+    assert list(read_captures(scene, tmp_path)) == [scene.views[0].name]
 
 
 def test_the_pictures_change_at_an_even_pace(run: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
+from PIL.PngImagePlugin import PngImageFile
 from scipy.stats import kendalltau
 
 from wildgs.light.captures import Capture, read_capture
@@ -77,6 +79,52 @@ def test_files_without_a_time_have_none(tmp_path: Path, content: bytes) -> None:
     Image.new("RGB", (4, 4)).save(tmp_path / "b.jpg")
     assert read_capture(tmp_path / "b.jpg") is None
     assert read_capture(tmp_path / "nothing.jpg") is None
+
+
+def _with_blocks(file: Path, **tags: dict) -> Path:
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = "2019:07:01 19:30:00"
+    for block, values in tags.items():
+        exif.get_ifd(getattr(IFD, block)).update(values)
+    Image.new("RGB", (8, 6)).save(file, exif=exif.tobytes())
+    return file
+
+
+@pytest.mark.parametrize(
+    "gps",
+    [
+        {GPS.GPSLatitudeRef: "", GPS.GPSLatitude: (52.0, 30.0, 0.0)},
+        {GPS.GPSLatitudeRef: "N", GPS.GPSLatitude: (1e9, 0.0, 0.0)},
+        {GPS.GPSTimeStamp: (99.0, 99.0, 99.0), GPS.GPSDateStamp: "2019:07:01"},
+        {GPS.GPSTimeStamp: (1.0, 1.0, 1.0), GPS.GPSDateStamp: "0000:00:00"},
+    ],
+)
+def test_absurd_places_and_clocks_are_not_known(tmp_path: Path, gps: dict) -> None:
+    east = {GPS.GPSLongitudeRef: "E", GPS.GPSLongitude: (13.0, 15.0, 0.0)}
+    capture = read_capture(_with_blocks(tmp_path / "a.jpg", GPSInfo=gps | east))
+    assert capture == Capture(datetime(2019, 7, 1, 19, 30))
+
+
+@pytest.mark.parametrize("stamp", ["0000:00:00 00:00:00", "2019:13:45 25:61:00", "  ", "0001:01:01 00:00:00"])
+def test_absurd_times_are_no_times(tmp_path: Path, stamp: str) -> None:
+    details = {Base.DateTimeOriginal: stamp, Base.OffsetTimeOriginal: "+23:00"}
+    capture = read_capture(_with_blocks(tmp_path / "a.jpg", Exif=details))
+    assert capture is None or capture.utc is None
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_a_pipe_has_no_time(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.jpg")
+    assert read_capture(tmp_path / "a.jpg") is None
+
+
+def test_pictures_without_a_block_are_not_decoded_for_it(tmp_path: Path, monkeypatch) -> None:
+    """Pillow looks for it behind the pixels: a PNG of 240 megapixels in 233 kB took gigabytes."""
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.png")
+    monkeypatch.setattr(PngImageFile, "load", lambda *_: pytest.fail("decoded"))
+    assert read_capture(tmp_path / "a.png") is None
+    monkeypatch.undo()
+    assert read_capture(_with_blocks(tmp_path / "b.png")) is not None
 
 
 def _world(photos: int = 40, seed: int = 0) -> tuple[dict[str, Pattern], dict[str, float]]:

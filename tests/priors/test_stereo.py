@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from tests.memory_views import make_view
+from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.priors.config import StereoConfig
 from wildgs.priors.stereo.depth import fill_metric_folder, stereo_depth
@@ -147,3 +148,13 @@ def test_files_hold_depth_in_units_of_the_model_and_are_read_in_those_of_the_sce
     torch.testing.assert_close(depth, torch.from_numpy(stored) * loaded.alignment.scale)
     assert fill_metric_folder(root, StereoConfig(), holdout=6) == (0, 5)
     assert not (root / "depth/p00.tiff").exists()  # held out
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"max_side": 10**6}, {"agreeing": 7}, {"max_cost": float("nan")}, {"tolerance": 0.0}, {"seed": -1}],
+)
+def test_options_with_which_nothing_agrees_are_refused(wrong: dict) -> None:
+    (name,) = wrong
+    with pytest.raises(UserError, match=f"--stereo.{name.replace('_', '-')} "):
+        StereoConfig(**wrong)

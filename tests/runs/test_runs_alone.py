@@ -13,7 +13,11 @@ from PIL import Image
 
 import wildgs
 from wildgs.config import read_config, with_entries, write_config
+from wildgs.engine.recorder import Recorder
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.library.day import known_day
+from wildgs.library.doctor import write_report
+from wildgs.library.logs import run_log
 from wildgs.light.photos import encode_view
 from wildgs.runs import CONFIG_FILE, load_run, prepare_training, require_same_scene
 from wildgs.scene import load_scene
@@ -164,6 +168,25 @@ def test_photos_masks_and_depth_that_were_exchanged_are_said(
     )
     with pytest.warns(WildGSWarning, match=said):
         run.read_scene(changed)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_pipes_in_a_run_folder_are_not_waited_for(moved: Path, tmp_path: Path) -> None:
+    for name in ("train.log", "metrics.jsonl", "photos.json", "day.json"):
+        (moved / name).unlink(missing_ok=True)
+        os.mkfifo(moved / name)
+    assert "not a regular file" in write_report([], moved)
+    with run_log(moved):
+        pass
+    with pytest.raises(UserError, match="not a regular file"):
+        Recorder(moved)
+    scene = wildgs.load(moved)
+    assert known_day(scene) is None
+    assert len(scene.photo_fits()) == 7
+    (moved / SCENE_FILE).unlink()
+    os.mkfifo(moved / SCENE_FILE)
+    with pytest.raises(UserError, match=r"scene\.safetensors.*not a regular file"):
+        _ = wildgs.load(moved).scene
 
 
 def test_another_scene_is_not_trained_into_a_run(trained: Path, old: Path, make_scene) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -124,6 +125,36 @@ def test_a_photo_that_was_lost_is_named(scene: Scene, tmp_path: Path) -> None:
         found.views[4].read_photo()
 
 
+@pytest.mark.parametrize("file", ["00004.jpg", "00003.mask.png"])
+@pytest.mark.parametrize("change", ["lost", "of another photo", "a pipe"])
+def test_lights_are_those_that_were_written(scene: Scene, tmp_path: Path, file: str, change: str) -> None:
+    """Without its mask, or with the photo of another run, a light would be another one, silently."""
+    found = carried(scene, tmp_path)
+    path, view = tmp_path / "lights" / file, found.views[int(file[:5])]
+    path.unlink()
+    if change == "a pipe":
+        os.mkfifo(path)
+    elif change != "lost":
+        Image.new("RGB" if file.endswith("jpg") else "1", (48, 32), 1).save(path)
+    said = {"lost": "no such file", "a pipe": "not a regular file"}.get(change, "damaged, or of another run")
+    with pytest.raises(UserError, match=rf"{file}: {said}.*{view.name}.*copy the whole run folder again"):
+        view.read_photo()
+
+
+def test_masks_that_an_earlier_attempt_left_are_not_used(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "lights").mkdir()
+    Image.new("1", (48, 32)).save(tmp_path / "lights" / "00002.mask.png")
+    assert carried(scene, tmp_path).views[2].read_mask() is None
+
+
+def test_runs_without_a_list_of_their_lights_open(scene: Scene, tmp_path: Path) -> None:
+    carry_scene(tmp_path, scene)
+    SceneRecord.of(scene).write(tmp_path / SCENE_FILE)  # as earlier versions did
+    found = read_carried_scene(tmp_path)
+    assert found is not None
+    assert found.views[3].read_mask() is not None
+
+
 def test_a_photo_that_is_gone_when_the_run_starts_is_left_out(scene: Scene, tmp_path: Path) -> None:
     lazy = load_scene(scene.root, lazy=True)
     (scene.root / "images" / "p02.png").unlink()
@@ -150,6 +181,8 @@ def test_a_record_cut_short_is_one_line(scene: Scene, tmp_path: Path, keep: int)
         {"K": torch.zeros(9, 3, 3)},
         {"viewmats": torch.full((9, 4, 4), float("nan"))},
         {"sizes": torch.zeros(9, 2, dtype=torch.int32)},
+        {"alignment": replace(Alignment.identity(), scale=float("nan"))},
+        {"sizes": torch.full((9, 2), 10**6, dtype=torch.int32)},
     ],
 )
 def test_a_record_that_makes_no_sense_is_one_line(scene: Scene, tmp_path: Path, change) -> None:

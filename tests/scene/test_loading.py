@@ -13,7 +13,7 @@ from PIL import Image
 
 from tests.scene_files import photo
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.scene import DataConfig, load_scene
+from wildgs.scene import DataConfig, Scene, load_scene
 from wildgs.scene.undistort import PixelGrid
 
 MakeScene = Callable[..., Path]
@@ -514,3 +514,49 @@ def test_observations_are_those_of_the_model(make_scene: MakeScene) -> None:
         scene = load_scene(root)
     pairs = {tuple(pair) for pair in scene.observations.tolist()}
     assert pairs == {(view, point) for view in range(3) for point in range(60)}
+
+
+def write_metric_depth(root: Path, scene: Scene, factor: float) -> None:
+    """Depth of a plane through the points of each photo, in units of the model."""
+    (root / "depth").mkdir(exist_ok=True)
+    for view in scene.views:
+        z = view.camera.project(scene.points)[1].median() / scene.alignment.scale
+        Image.fromarray(np.full((H, W), factor * float(z), np.float32)).save(
+            root / f"depth/{view.name[:3]}.tiff"
+        )
+
+
+@pytest.mark.parametrize("factor", [3.3, 0.3])
+def test_metric_depth_in_other_units_is_refused(make_scene: MakeScene, factor: float) -> None:
+    """Metres, or the units of a model that was replaced, would put Gaussians where there is nothing."""
+    root = make_scene(4)
+    scene = load_scene(root)
+    write_metric_depth(root, scene, 1.0)
+    load_scene(root)
+    write_metric_depth(root, scene, factor)
+    with pytest.raises(UserError, match=rf"metric depth \(.tiff\) is {int(factor)}[.\d]* times as large"):
+        load_scene(root)
+    load_scene(root, DataConfig(use_depth=False))
+
+
+def test_what_metric_depth_may_hold(make_scene: MakeScene, tmp_path: Path) -> None:
+    root = make_scene(6)
+    scene = load_scene(root)
+    write_metric_depth(root, scene, 1.0)
+    values = np.array(Image.open(root / "depth/p01.tiff"))
+    values[0, :4] = [np.nan, np.inf, -1, 3e38]
+    Image.fromarray(values).save(root / "depth/p01.tiff")
+    Image.fromarray(np.full((H, W), 9, np.uint16)).save(root / "depth/p02.tiff")
+    Image.fromarray(values[:, :9]).save(root / "depth/p03.tiff")
+    (root / "depth/p04.tiff").write_bytes(b"no picture")
+    (root / "depth/p05.tiff").write_bytes(b"")
+    with pytest.warns(WildGSWarning) as said:
+        loaded = load_scene(root, DataConfig(holdout=0))
+    assert len(said) == 4
+    assert all("trains without depth" in str(each.message) for each in said)
+    depth = [view.read_depth() for view in loaded.views]
+    assert depth[0] is not None
+    assert depth[1] is not None
+    assert depth[2:] == [None] * 4
+    assert depth[1].isfinite().all()
+    assert (depth[1][0, :3] == 0).all()

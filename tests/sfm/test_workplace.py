@@ -1,5 +1,7 @@
+from contextlib import closing
 from pathlib import Path
 
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -43,6 +45,55 @@ def test_interrupted_work_continues(photos: Path, tmp_path: Path) -> None:
         assert work.is_done("matches")
         assert work.load_models("first") is None
     assert sorted(p.name for p in tmp_path.iterdir()) == ["p"]
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:5000], lambda content: content[:4096] * 3])
+def test_a_damaged_database_is_not_continued(photos: Path, tmp_path: Path, damage) -> None:
+    """COLMAP ends the process when it reads one, every time anew."""
+    interrupt(photos, tmp_path / "out")
+    database = work_folder(tmp_path / "out") / "database.db"
+    with closing(pycolmap.Database.open(database)):
+        pass
+    with open_workplace(photos, tmp_path / "out", SfmConfig()) as work:
+        assert work.is_done("matches")
+    interrupt(photos, tmp_path / "out")
+    with closing(pycolmap.Database.open(database)):
+        pass
+    database.write_bytes(damage(database.read_bytes()))
+    with (
+        pytest.warns(WildGSWarning, match="damaged; beginning anew"),
+        open_workplace(photos, tmp_path / "out", SfmConfig()) as work,
+    ):
+        assert not work.is_done("matches")
+
+
+@pytest.mark.parametrize("change", ["cut", "gone", "record"])
+def test_copies_that_are_not_as_they_were_written_are_made_anew(
+    photos: Path, tmp_path: Path, change: str
+) -> None:
+    with open_workplace(photos, tmp_path / "out", SfmConfig()) as work:
+        work.images.mkdir()
+        copy = work.images / "0.jpg"
+        copy.write_bytes(b"a photo")
+        work.save_copies([], {})
+        assert work.load_copies() == ([], {})
+        if change == "cut":
+            copy.write_bytes(b"")
+        elif change == "gone":
+            copy.unlink()
+        else:
+            (work.root / "copies.json").write_text('{"copies": [{"name": 3}], "broken": {}}')
+        assert work.load_copies() is None
+
+
+def test_a_damaged_model_is_mapped_again(photos: Path, tmp_path: Path) -> None:
+    with open_workplace(photos, tmp_path / "out", SfmConfig()) as work:
+        work.save_models("first", [pycolmap.Reconstruction()])
+        models = work.load_models("first")
+        assert models is not None
+        assert len(models) == 1
+        (work.root / "first/0/cameras.bin").write_bytes(b"")
+        assert work.load_models("first") is None
 
 
 @pytest.mark.parametrize("what", ["photos", "options"])

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -205,3 +210,35 @@ def test_a_page_of_another_site_gets_nothing(
     own = browse(address(viewer.server, ServerConfig()))
     wait_for(viewer.server.get_clients)
     assert own.evaluate("document.querySelectorAll('canvas').length") > 0
+
+
+@pytest.fixture
+def training(landmark: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """`wildgs train --view`, as a process of its own; killed where the test leaves it."""
+    command = [sys.executable, "-m", "wildgs", "train", str(landmark), "--output", str(tmp_path / "run")]
+    options = ["--method", "3dgs", "--steps", "1000000", "--view", "--server.port", "0"]
+    with subprocess.Popen(command + options, stdout=subprocess.PIPE, text=True) as process:
+        yield process
+        process.kill()
+
+
+def test_a_training_is_shown_to_its_own_page_alone(
+    training: subprocess.Popen[str], tmp_path: Path, browse: Callable, foreign_site: Callable
+) -> None:
+    assert training.stdout is not None
+    url = next(line.split("viewer: ")[1].strip() for line in training.stdout if "viewer: " in line)
+    threading.Thread(target=training.stdout.read, daemon=True).start()
+    attack(browse, foreign_site, int(url.split("/")[2].split(":")[1]), url.split("/")[3])
+    own = browse(url)
+    steps = set()
+
+    def goes_on() -> bool:
+        found = re.search(r"step ([\d,]+) of 1,000,000", own.evaluate("document.body?.innerText ?? ''"))
+        steps.add(found and found[1])
+        return len(steps - {None}) > 1
+
+    wait_for(goes_on)
+    assert own.evaluate("document.querySelectorAll('canvas').length") > 0
+    training.send_signal(signal.SIGTERM)
+    assert training.wait(120) == 128 + signal.SIGTERM
+    assert list((tmp_path / "run" / "checkpoints").iterdir())

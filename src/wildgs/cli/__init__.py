@@ -99,12 +99,15 @@ def _run(verb: str, arguments: list[str]) -> None:
     command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=description)
     from wildgs.cli.screen import Lines
 
+    if verb != "doctor":  # which says what is missing
+        # With pycolmap, whose handler of SIGTERM would take the place of ours and print a C++ stack.
+        importlib.import_module("wildgs.scene")
     lines, level = Lines(), logger.level
     logger.addHandler(lines)
     logger.setLevel(min(logging.INFO, level or logging.INFO))
     showwarning = warnings.showwarning
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), processes.signals_as_interrupts():
             warnings.showwarning = _show_warning
             warnings.simplefilter("always", WildGSWarning)
             module.run(command)

@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import remove_leftovers, written_aside
+from wildgs.files import check_regular, remove_leftovers, written_aside
 
 KEPT = 2
 DAMAGED = ".damaged"
@@ -103,6 +103,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         UserError: The file is missing, or cannot be read for another reason (permissions, memory).
     """
     try:
+        check_regular(path)
         with path.open("rb"):  # tells a missing permission from damage
             pass
         with safe_open(path, framework="pt") as file:
@@ -124,6 +125,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def load_header(path: Path) -> dict[str, Any]:
     """The header of a checkpoint, without tensors and checksum; empty if it cannot be read."""
     try:
+        check_regular(path)
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get("wildgs", "{}"))
     except (OSError, SafetensorError, ValueError, RecursionError):

@@ -14,7 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import printable, written_aside
+from wildgs.files import check_regular, is_there, printable, written_aside
 
 
 class Recorder:
@@ -44,6 +44,8 @@ class Recorder:
             )
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            if is_there(lines):
+                check_regular(lines)  # opening a pipe would wait for its reader
             _keep_until(lines, step)
             self._lines = lines.open("a", encoding="utf-8")
             self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from torch.nn import functional
 from wildgs.errors import UserError
 from wildgs.evaluation.metrics import MAX_PSNR
 from wildgs.evaluation.pictures import write_json
+from wildgs.files import read_json
 from wildgs.model.method import Method
 from wildgs.rasterize import blend
 from wildgs.scene.scene import Scene, View, observed_pixels
@@ -247,7 +247,7 @@ def write_photos(folder: Path, step: int, photos: Sequence[PhotoFit]) -> None:
 def read_photos(folder: Path, step: int) -> list[PhotoFit] | None:
     """What `write_photos` wrote after so many steps; None where there is no such file."""
     try:
-        content = json.loads((folder / PHOTOS_FILE).read_text(encoding="utf-8"))
+        content = read_json(folder / PHOTOS_FILE)
         return [PhotoFit(**photo) for photo in content["photos"]] if content["step"] == step else None
     except (
         OSError,

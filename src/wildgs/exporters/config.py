@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from wildgs.errors import UserError
+
+_RANGES = {
+    "min_opacity": (0, 1),
+    "max_distance": (0, 1e9),
+    "crop": (0, 1e9),
+    "sh_degree": (0, 3),
+    "own_harmonics": (0, 1),
+}
+
 
 @dataclass(frozen=True)
 class CleanupConfig:
@@ -28,6 +38,13 @@ class CleanupConfig:
     drop_sky: bool = False
     sh_degree: int | None = None
     own_harmonics: float = 0.09
+
+    def __post_init__(self) -> None:
+        """Refuses values that mean nothing, NaN among them."""
+        for name, (least, most) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
+                raise UserError(f"--{name.replace('_', '-')} {value}: must be from {least:g} to {most:g}")
 
     @property
     def active(self) -> bool:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from wildgs.errors import UserError
 from wildgs.exporters.lights import RelightableScene, SharedHarmonics
 from wildgs.exporters.thumbnail import thumbnail_url
+from wildgs.files import printable
 from wildgs.geometry.camera import Camera
 from wildgs.version import __version__
 
@@ -83,20 +84,21 @@ def glb_bytes(scene: RelightableScene, harmonics: SharedHarmonics) -> bytes:
         colors |= _add_rest(document, harmonics, number, rest, views)
         extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
         primitive = {"attributes": geometry | colors, "mode": 0, "extensions": {EXTENSION: extension}}
-        meshes.append({"name": light.name, "primitives": [primitive]})
-        nodes += [{"name": light.name, "mesh": number}, _camera_node(scene.start)]
+        name = printable(light.name)
+        meshes.append({"name": name, "primitives": [primitive]})
+        nodes += [{"name": name, "mesh": number}, _camera_node(scene.start)]
         extras = {
-            "photo": light.name,
+            "photo": name,
             "captured": light.captured,
             "thumbnail": thumbnail_url(light.thumbnail),
         }
         extras = {key: value for key, value in extras.items() if value is not None}
-        scenes.append({"name": light.name, "nodes": [2 * number, 2 * number + 1], "extras": extras})
+        scenes.append({"name": name, "nodes": [2 * number, 2 * number + 1], "extras": extras})
     content = {
         "asset": {
             "version": "2.0",
             "generator": f"Wild-GS {__version__}",
-            "extras": {"title": scene.title, "to_colmap": scene.placement.to_dict()},
+            "extras": {"title": printable(scene.title), "to_colmap": scene.placement.to_dict()},
         },
         "extensionsUsed": [EXTENSION],
         "scene": 0,

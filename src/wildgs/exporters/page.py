@@ -126,7 +126,8 @@ def _compose(page: Page, scene: PackedScene) -> str:
         "day": page.day,
         "start": _start(page.start),
         "lights": [
-            {"name": light.name, "thumbnail": thumbnail_url(light.thumbnail)} for light in page.lights
+            {"name": printable(light.name), "thumbnail": thumbnail_url(light.thumbnail)}
+            for light in page.lights
         ],
     }
     return Template(web.joinpath("page.html").read_text(encoding="utf-8")).substitute(

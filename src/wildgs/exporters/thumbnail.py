@@ -18,9 +18,8 @@ def thumbnail_url(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
     image = Image.fromarray(np.ascontiguousarray(pixels))
     wide, tall = THUMBNAIL
     scale = max(wide / image.width, tall / image.height)
-    size = (max(wide, round(image.width * scale)), max(tall, round(image.height * scale)))
-    image = image.resize(size, Image.Resampling.LANCZOS)
-    left, top = (image.width - wide) // 2, (image.height - tall) // 2
+    left, top = (image.width - wide / scale) / 2, (image.height - tall / scale) / 2
+    box = (max(left, 0), max(top, 0), image.width - max(left, 0), image.height - max(top, 0))
     buffer = io.BytesIO()
-    image.crop((left, top, left + wide, top + tall)).save(buffer, "JPEG", quality=_QUALITY)
+    image.resize(THUMBNAIL, Image.Resampling.LANCZOS, box=box).save(buffer, "JPEG", quality=_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -86,8 +86,11 @@ def variant_names(pxr: Any, names: list[str]) -> list[str]:
     """Names of photos as identifiers that USD accepts, each once."""
     found: list[str] = []
     for name in names:
-        valid = pxr.Tf.MakeValidIdentifier(Path(name).stem)
-        found.append(valid if valid not in found else f"{valid}_{len(found)}")
+        valid, number = pxr.Tf.MakeValidIdentifier(printable(Path(name).stem)), 2
+        free = valid
+        while free in found:
+            free, number = f"{valid}_{number}", number + 1
+        found.append(free)
     return found
 
 

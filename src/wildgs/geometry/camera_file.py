@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from wildgs.errors import UserError
-from wildgs.files import check_regular, written_aside
+from wildgs.files import read_json, written_aside
 from wildgs.geometry.camera import Camera
 
 Frame = Literal["scene", "colmap"]
@@ -25,6 +25,7 @@ DATAPARSER_FILE = "dataparser_transforms.json"
 DEFAULT_FPS = 30.0
 MAX_SIDE = 32_768
 """Upper bound on width and height in pixels, since images of this size are allocated."""
+LEAST_FOCAL, MAX_INTRINSIC = 1e-3, 1e9
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,10 @@ def read_camera_path(file: Path) -> CameraPath:
         UserError: The file is missing or not a valid camera file; the message names the entry.
     """
     try:
-        check_regular(file)
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file)
     except FileNotFoundError as error:
         raise UserError(f"{file}: no such file; give a camera file or one of the built-in paths") from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise UserError(f"{file}: cannot be read as JSON ({error})") from error
     try:
         if isinstance(content, dict) and "camera_path" in content:
@@ -114,7 +114,7 @@ def _from_nerfstudio(content: dict[str, Any], transforms: Path) -> CameraPath:
     width, height = (_whole(content[key], key) for key in ("render_width", "render_height"))
     transform = np.eye(4)
     if transforms.is_file():
-        parsed = json.loads(transforms.read_text(encoding="utf-8"))
+        parsed = read_json(transforms)
         transform[:3] = _matrix(parsed["transform"], (3, 4), transforms.name)
         transform[:3] *= float(parsed["scale"])
     back = np.linalg.inv(transform)
@@ -135,8 +135,14 @@ def _camera(
     viewmat: Float64[np.ndarray, "4 4"], K: Float64[np.ndarray, "3 3"], width: int, height: int
 ) -> Camera:
     rotation = viewmat[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    if not rigid or viewmat[3, 3] != 1:
         raise ValueError("a camera pose is not a rigid transform")
+    pinhole = [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]]
+    if not np.array_equal(K, pinhole) or min(K[0, 0], K[1, 1]) < LEAST_FOCAL or K.max() > MAX_INTRINSIC:
+        raise ValueError(
+            "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with focal lengths above 0, in pixels"
+        )
     return Camera(torch.from_numpy(viewmat), torch.from_numpy(K), width, height)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
 from wildgs.evaluation.published import published_figures
-from wildgs.files import written_aside
+from wildgs.files import check_regular, read_json, written_aside
 from wildgs.library.benchmark_plan import (
     PHOTOTOURISM_DOWNSCALE,
     Job,
@@ -34,7 +33,7 @@ from wildgs.library.benchmark_plan import (
     parse_variant,
 )
 from wildgs.library.config import Suite, default_bench_methods, reference_preset
-from wildgs.library.evaluation import PROTOCOLS, evaluate
+from wildgs.library.evaluation import PROTOCOLS, check_lpips, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.training import read_scene, train
 from wildgs.progress import Progress
@@ -117,6 +116,7 @@ def benchmark(
     Raises:
         UserError: Something that was asked for does not exist, or the output holds other runs.
     """
+    check_lpips(lpips)
     lpips, execution = None if lpips is None else Path(lpips), execution or ExecutionConfig()
     announce = announce or logger.info
     request = _Request(Path(output), suite, variants, lpips, execution, progress, observers, announce)
@@ -202,6 +202,7 @@ class _Bench:
         """Why a job failed since this bench began, in any process; None if it did not."""
         file = job.folder / FAILURE_FILE
         try:
+            check_regular(file)
             return file.read_text(encoding="utf-8") if file.stat().st_mtime >= self._began else None
         except OSError:
             return None
@@ -300,7 +301,7 @@ class _Bench:
 def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
     """The scores of a run; None if there are none, or they cannot be read."""
     try:
-        content = json.loads((folder / "eval" / protocol / "metrics.json").read_text(encoding="utf-8"))
+        content = read_json(folder / "eval" / protocol / "metrics.json")
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) and "step" in content and "mean" in content else None

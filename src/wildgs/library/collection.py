@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from wildgs.errors import UserError
-from wildgs.files import check_regular, is_there, written_aside
+from wildgs.files import is_there, read_json, written_aside
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.upright import list_photos, scene_names
 
@@ -117,11 +117,10 @@ def _read(file: Path) -> tuple[dict[str, PhotoRecord] | None, dict[str, object]]
     if not is_there(file):
         return None, {}
     try:
-        check_regular(file)
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file)
         records = {str(name): PhotoRecord(**record) for name, record in content["photos"].items()}
         return records, dict(content["sfm"])
-    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
         raise UserError(f"{file} cannot be read ({error}); delete it, or choose another --output") from error
 
 

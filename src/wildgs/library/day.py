@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
@@ -14,7 +16,7 @@ import torch
 from wildgs.errors import UserError
 from wildgs.evaluation.photos import find_misfits, read_photos
 from wildgs.exporters.page import choose_start
-from wildgs.files import written_aside
+from wildgs.files import read_json, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
 from wildgs.library.times import read_captures
@@ -47,11 +49,11 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
         progress: Called for every photo.
 
     Raises:
-        UserError: The run has one light only, or too few photos.
+        UserError: The run has one light only, or too few photos; there is no folder `photos`.
     """
     captures = read_captures(loaded, photos)
-    kept = loaded.run.folder / DAY_FILE
-    found = None if photos is not None else _read(kept, loaded.run.step, len(captures))
+    kept, timed = loaded.run.folder / DAY_FILE, _digest(captures)
+    found = None if photos is not None else _read(kept, loaded, timed)
     if found is not None:
         return found
     views = _usable_views(loaded)
@@ -66,7 +68,7 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
     assert day is not None  # there are enough photos
     try:
         with written_aside(kept) as aside:
-            content = {"step": loaded.run.step, "timed": len(captures), **asdict(day)}
+            content = {"step": loaded.run.step, "timed": timed, **asdict(day)}
             aside.write_text(json.dumps(content, indent=1), encoding="utf-8")
     except UserError:  # a run on a read-only disk can still be shown
         pass
@@ -102,14 +104,20 @@ def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None)
     return found
 
 
-def _read(file: Path, step: int, timed: int | None = None) -> Day | None:
-    """What was found before for the same checkpoint and, unless None, the same number of photos with times."""
+def _digest(captures: dict[str, Capture]) -> str:
+    return hashlib.sha256(repr(sorted(captures.items())).encode()).hexdigest()[:16]
+
+
+def _read(file: Path, loaded: LoadedScene, timed: str | None = None) -> Day | None:
+    """What was found before for the same checkpoint and, unless None, the same times; None if it is damaged."""
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file)
         found_step, found_timed = content.pop("step"), content.pop("timed")
-        if found_step != step or timed not in (None, found_timed):
+        if found_step != loaded.run.step or timed not in (None, found_timed):
             return None
-        return Day(**{**content, "keys": tuple(content["keys"])})
+        day = Day(**{**content, "keys": tuple(content["keys"]), "left_out": {**content["left_out"]}})
+        known = set(day.keys) <= set(day.phases) <= {view.name for view in loaded.views}
+        return day if day.keys and known and all(map(math.isfinite, day.phases.values())) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -127,7 +135,7 @@ def has_day(loaded: LoadedScene) -> bool:
 
 def known_day(loaded: LoadedScene) -> Day | None:
     """The day that was found for the run before, if one was."""
-    return _read(loaded.run.folder / DAY_FILE, loaded.run.step)
+    return _read(loaded.run.folder / DAY_FILE, loaded)
 
 
 def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from wildgs.files import check_regular
 from wildgs.library.logs import LOG_FILE
 from wildgs.runs import CONFIG_FILE
 
@@ -296,6 +297,7 @@ def _versions() -> list[str]:
 def _tail(path: Path, count: int) -> str:
     """The last lines of a file, however long it is."""
     try:
+        check_regular(path)
         with path.open("rb") as file:
             file.seek(0, 2)
             file.seek(max(0, file.tell() - LOG_BYTES))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from wildgs.errors import UserError
 from wildgs.evaluation.protocol import Protocol
 from wildgs.evaluation.protocol import evaluate as score_views
 from wildgs.library.loaded import LoadedScene
@@ -38,8 +39,9 @@ def evaluate(
         progress: Called for every photo read and every view scored.
 
     Raises:
-        UserError: There is no such run, the photos are gone, or none is held out.
+        UserError: There is no such run or folder, the photos are gone, or none is held out.
     """
+    check_lpips(lpips)
     loaded = opened(run)
     if not isinstance(scene, Scene):
         scene = read_run_scene(loaded, scene, progress)
@@ -61,6 +63,12 @@ def evaluate(
             on_view=count,
         )
     return scores
+
+
+def check_lpips(folder: str | Path | None) -> None:
+    """Raises `UserError` if a folder of LPIPS weights was asked for and is not there."""
+    if folder is not None and not Path(folder).is_dir():
+        raise UserError(f"--lpips {folder}: no such folder; leave it out for the weights of the package")
 
 
 def read_run_scene(run: Run, root: str | Path | None = None, progress: Progress | None = None) -> Scene:

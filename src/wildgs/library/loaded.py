@@ -20,7 +20,7 @@ from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.photos import PhotoFit, find_misfits, inspect_photos, read_photos, write_photos
 from wildgs.geometry.camera import Camera
 from wildgs.library.config import MixOptions
-from wildgs.light.look import Look, Timeline, mix, with_sky
+from wildgs.light.look import NEUTRAL, Look, Timeline, mix, with_sky
 from wildgs.light.saved import save_look
 from wildgs.light.sources import LightSources
 from wildgs.model.gaussians import Gaussians
@@ -250,8 +250,12 @@ def find_looks(
         return scene.appearance(spec, like=mixing.like, progress=progress)
 
     parts = (mixing.global_, mixing.local)
-    if None not in parts:
-        specs = ()  # both parts come from elsewhere
+    if None not in parts:  # both parts come from elsewhere
+        if mixing.weights or tuple(specs) not in ((), (NEUTRAL,)):
+            raise UserError(
+                "--global and --local make the whole appearance; leave --appearance and --weights out"
+            )
+        specs = ()
     looks = [find(spec) for spec in specs]
     if mixing.weights:
         looks = [mix(looks, mixing.weights)]

@@ -15,6 +15,7 @@ from typing import Any
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError
+from wildgs.files import check_regular, is_there
 
 LOG_FILE = "train.log"
 
@@ -26,6 +27,8 @@ def run_log(folder: Path) -> Iterator[None]:
     """Appends to the run's log while the block runs; training continues without it if it cannot be written."""
     logging.raiseExceptions = False  # a full disk must not fill the console with tracebacks of the log
     try:
+        if is_there(folder / LOG_FILE):
+            check_regular(folder / LOG_FILE)  # opening a pipe would wait for its reader
         handler = logging.FileHandler(folder / LOG_FILE, encoding="utf-8", errors="backslashreplace")
     except OSError:
         yield

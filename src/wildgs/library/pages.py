@@ -34,7 +34,7 @@ from wildgs.model.method import Method
 from wildgs.progress import Progress
 from wildgs.runs import Run
 from wildgs.scene import Scene, View, match_view
-from wildgs.scene.images import read_photo
+from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.sfm.report import describe_placed, read_left_out
 
 PAGE_LIGHTS = 6
@@ -175,11 +175,19 @@ def write_showcase(
         masks=_beside_masks(shown, scene, others[:MASKS]),
         poses=describe_placed(scene.root),
         unplaced=tuple(
-            ReportUnplaced(photo.name, photo.reason, photo.picture and read_photo(photo.picture).pixels)
+            ReportUnplaced(photo.name, photo.reason, _matches(photo.picture))
             for photo in read_left_out(scene.root)
         ),
     )
     write_report(report, file)
+
+
+def _matches(picture: Path | None) -> np.ndarray | None:
+    """The picture of a photo's best matches; None where there is none that can be read."""
+    try:
+        return None if picture is None else read_photo(picture).pixels
+    except UnreadableImageError:
+        return None
 
 
 @torch.no_grad()

@@ -92,6 +92,8 @@ def render(
     output, trajectory = Path(output), trajectory or TrajectoryOptions()
     if trajectory.size is not None:
         check_size(*trajectory.size)
+    if photos is not None and over is None:
+        raise UserError("--photos tells the hours of photos for --over day; leave it out")
     if over is not None:
         return _render_day(loaded(run), output, photos, views, trajectory, progress)
     if trajectory.path is None and not is_video(output):

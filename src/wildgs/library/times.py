@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from wildgs.errors import UserError
+from wildgs.files import is_file
 from wildgs.library.loaded import LoadedScene
 from wildgs.light.captures import Capture, read_capture
 from wildgs.scene.colmap import find_model
+from wildgs.scene.photo_store import with_ending
 
 
 def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, Capture]:
@@ -14,16 +17,36 @@ def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, 
 
     Args:
         loaded: The run.
-        photos: Folder of the original photos; None looks in the scene folder of the run, where the undistorted
-            photos of `wildgs sfm` keep time and place, and at the run's own copies of its photos.
+        photos: Folder of the original photos, whose endings may differ from those of the scene; None looks in the
+            scene folder of the run, where the undistorted photos of `wildgs sfm` keep time and place, and at the
+            run's own copies of its photos.
+
+    Raises:
+        UserError: There is no folder `photos`.
     """
-    found = {}
+    originals = None if photos is None else _by_stem(photos)
     folder = photos or _scene_photos(loaded)
+    found = {}
     for view in loaded.views:
-        files = [folder and folder / view.name, None if photos else view.photos.file(view.name)]
-        captures = (read_capture(file) for file in files if file is not None)
+        files = [folder and folder / view.name]
+        if originals is None:
+            files.append(view.photos.file(view.name))
+        else:
+            files.append(originals.get(with_ending(view.name, "")))
+        captures = (read_capture(file) for file in files if file is not None and is_file(file))
         found[view.name] = next((capture for capture in captures if capture is not None), None)
     return {name: capture for name, capture in found.items() if capture is not None}
+
+
+def _by_stem(photos: Path) -> dict[str, Path]:
+    """The files of a folder by their path in it without ending."""
+    if not photos.is_dir():
+        raise UserError(f"{photos}: no such folder; give the folder of the original photos")
+    return {
+        with_ending(path.relative_to(photos).as_posix(), ""): path
+        for path in sorted(photos.rglob("*"))
+        if is_file(path)
+    }
 
 
 def _scene_photos(loaded: LoadedScene) -> Path | None:

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
+from wildgs.scene.images import open_image
+
 _TIME = "%Y:%m:%d %H:%M:%S"
+_PNG_BLOCKS = {"exif", "Raw profile type exif"}
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,9 @@ class Capture:
 def read_capture(file: Path) -> Capture | None:
     """Reads the EXIF block of a photo; None where there is none that makes sense."""
     try:
-        with Image.open(file) as image:
+        with open_image(file) as image:
+            if image.format == "PNG" and not image.info.keys() & _PNG_BLOCKS:
+                return None  # Pillow would decode all pixels in search of a block behind them
             exif = image.getexif()
             details, gps = exif.get_ifd(IFD.Exif), exif.get_ifd(IFD.GPSInfo)
         # `DateTime` is when the file was changed last, which says nothing about the light.
@@ -47,7 +51,7 @@ def _utc(gps: dict) -> datetime | None:
         hours, minutes, seconds = (float(part) for part in gps[GPS.GPSTimeStamp])
         day = datetime.strptime(str(gps[GPS.GPSDateStamp]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
         return day.replace(hour=int(hours), minute=int(minutes), second=int(seconds))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
 
@@ -56,7 +60,7 @@ def _zoned(local: datetime, details: dict) -> datetime | None:
     zone = details.get(Base.OffsetTimeOriginal) or details.get(Base.OffsetTime)
     try:
         return datetime.fromisoformat(f"{local.isoformat()}{str(zone).strip(chr(0) + ' ')}").astimezone(UTC)
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
 
 
@@ -64,13 +68,13 @@ def _place(gps: dict) -> tuple[float, float] | None:
     try:
         latitude, longitude = (
             sum(float(part) / 60**power for power, part in enumerate(gps[tag]))
-            * (-1 if gps[ref] in low else 1)
-            for tag, ref, low in (
-                (GPS.GPSLatitude, GPS.GPSLatitudeRef, "sS"),
-                (GPS.GPSLongitude, GPS.GPSLongitudeRef, "wW"),
+            * {high: 1, low: -1}[gps[ref].strip("\0 ").upper()]
+            for tag, ref, high, low in (
+                (GPS.GPSLatitude, GPS.GPSLatitudeRef, "N", "S"),
+                (GPS.GPSLongitude, GPS.GPSLongitudeRef, "E", "W"),
             )
         )
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError):
         return None
     valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0.0, 0.0)
     return (latitude, longitude) if valid else None

@@ -70,7 +70,19 @@ class StereoConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuses values with which nothing can be compared."""
-        for name, least in (("max_side", 32), ("neighbours", 1), ("agreeing", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"stereo.{name} {getattr(self, name)}: must be {least} or more")
+        """Refuses values with which nothing can be compared, NaN among them."""
+        ranges = {
+            "max_side": (32, 4096),
+            "neighbours": (1, 64),
+            "agreeing": (1, self.neighbours),
+            "max_cost": (0, 2),
+            "tolerance": (1e-6, 1),
+            "reach": (1e-3, 1e3),
+            "support": (0, 49),
+            "seed": (0, 2**31 - 1),
+        }
+        for name, (least, most) in ranges.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                option = name.replace("_", "-")
+                raise UserError(f"--stereo.{option} {value}: must be from {least:g} to {most:g}")

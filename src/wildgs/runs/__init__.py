@@ -19,6 +19,7 @@ from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, 
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import is_there
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
 from wildgs.progress import Counter
@@ -88,7 +89,7 @@ class Run:
         """
         root = self._scene_folder(root)
         found = load_scene(root, self.config.data, alignment=self.alignment, progress=progress)
-        if not (self.folder / SCENE_FILE).is_file():
+        if not is_there(self.folder / SCENE_FILE):
             return found
         return adopt_scene(SceneRecord.read(self.folder / SCENE_FILE), found, self.folder)
 
@@ -96,8 +97,9 @@ class Run:
         root = root or self.config.scene
         if not root.is_dir():
             raise UserError(
-                f"{root}: no such folder; {self.folder} was trained on the photos there: "
-                "give the folder where they are now by --scene"
+                f"{root}: no such folder; {self.folder} was trained on the photos there: give `wildgs eval` the "
+                "folder where they are now by --scene; a run of an earlier version carries them once it is resumed "
+                f"(`wildgs train SCENE --output {self.folder} --resume`)"
             )
         return root
 

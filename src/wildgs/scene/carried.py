@@ -6,16 +6,17 @@ smaller where it is large, and its mask: what the photo's appearance is read fro
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image
 
 from wildgs.errors import UserError
-from wildgs.files import written_aside
+from wildgs.files import check_regular, is_there, written_aside
 from wildgs.progress import Counter, in_threads
 from wildgs.scene.capture import carry_capture
 from wildgs.scene.image_cache import DECODERS, ImageCache
@@ -54,17 +55,17 @@ def carry_scene(folder: Path, scene: Scene, progress: Counter | None = None) -> 
     lights = folder / LIGHTS_FOLDER
     side = carried_side([(view.camera.width, view.camera.height) for view in scene.views])
 
-    def write(numbered: tuple[int, View]) -> None:
+    def write(numbered: tuple[int, View]) -> list[Path]:
         number, view = numbered
         try:
             photo = view.photos.get(view.name)
         except UserError:  # gone since it was first read; training continues without it, too
-            return
-        _write_photo(lights, number, photo, side, view.photos.file(view.name))
+            return []
+        return _write_photo(lights, number, photo, side, view.photos.file(view.name))
 
-    for _ in in_threads(write, list(enumerate(scene.views)), DECODERS, progress):
-        pass
-    SceneRecord.of(scene).write(folder / SCENE_FILE)
+    written = in_threads(write, list(enumerate(scene.views)), DECODERS, progress)
+    carried = {file.name: _digest(file) for files in written for file in files}
+    replace(SceneRecord.of(scene), carried=carried).write(folder / SCENE_FILE)
 
 
 def carried_side(sizes: Sequence[tuple[int, int]]) -> int:
@@ -74,20 +75,29 @@ def carried_side(sizes: Sequence[tuple[int, int]]) -> int:
     return max(MIN_SIDE, min(MAX_SIDE, within_total))
 
 
-def _write_photo(lights: Path, number: int, photo: Photo, side: int, original: Path | None) -> None:
+def _write_photo(lights: Path, number: int, photo: Photo, side: int, original: Path | None) -> list[Path]:
     height, width = photo.pixels.shape[:2]
     shrink = min(1.0, side / max(width, height))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     image = Image.fromarray(photo.pixels)
-    with written_aside(_photo_file(lights, number)) as aside:
+    files = [_photo_file(lights, number)]
+    with written_aside(files[0]) as aside:
         small = image if size == image.size else image.resize(size, Image.Resampling.LANCZOS)
         small.save(aside, "JPEG", quality=QUALITY, subsampling=0)
         if original is not None:
             carry_capture(original, aside)
     if photo.mask is not None:
         mask = np.array(Image.fromarray(photo.mask).resize(size, Image.Resampling.BOX)) > 127
-        with written_aside(_mask_file(lights, number)) as aside:
+        files.append(_mask_file(lights, number))
+        with written_aside(files[1]) as aside:
             Image.fromarray(mask).save(aside, "PNG")
+    return files
+
+
+def _digest(file: Path) -> str:
+    check_regular(file)
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()[:16]
 
 
 def _photo_file(lights: Path, number: int) -> Path:
@@ -105,7 +115,7 @@ def read_carried_scene(folder: Path) -> Scene | None:
     Raises:
         UserError: The file cannot be read.
     """
-    if not (folder / SCENE_FILE).is_file():
+    if not is_there(folder / SCENE_FILE):
         return None
     record = SceneRecord.read(folder / SCENE_FILE)
     return record.scene(folder, CarriedPhotos(folder / LIGHTS_FOLDER, record))
@@ -129,6 +139,7 @@ class CarriedPhotos(PhotoStore):
         """Reads from a folder `lights/` the photos of a recorded scene."""
         self._folder = folder
         self._numbers = {name: number for number, name in enumerate(record.names)}
+        self._digests = record.carried
         self._sizes = [(int(width), int(height)) for width, height in record.sizes]
         self._cache = ImageCache(0)
         self.detail = carried_side(self._sizes)
@@ -149,12 +160,25 @@ class CarriedPhotos(PhotoStore):
         number = self._numbers[name]
         path, size = _photo_file(self._folder, number), self._sizes[number]
         try:
-            return Photo(read_photo(path, size=size).pixels, self._read_mask(number, size))
+            pixels = read_photo(self._checked(path), size=size).pixels
+            path = _mask_file(self._folder, number)
+            return Photo(pixels, read_mask(self._checked(path), size) if self._carries(path) else None)
         except UnreadableImageError as error:
             raise UserError(
                 f"{path}: {error}; it is the run's copy of {name}: copy the whole run folder again"
             ) from error
 
-    def _read_mask(self, number: int, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"] | None:
-        path = _mask_file(self._folder, number)
-        return read_mask(path, size) if path.is_file() else None
+    def _carries(self, path: Path) -> bool:
+        return path.name in self._digests if self._digests else is_there(path)
+
+    def _checked(self, path: Path) -> Path:
+        """The path of a file that is the one written with the run; `UnreadableImageError` if it is another."""
+        expected = self._digests.get(path.name)
+        try:
+            if expected is not None and _digest(path) != expected:
+                raise UnreadableImageError("damaged, or of another run")
+        except FileNotFoundError:
+            raise UnreadableImageError("no such file") from None
+        except OSError as error:
+            raise UnreadableImageError(error.strerror or str(error)) from error
+        return path

@@ -15,6 +15,7 @@ from wildgs.progress import Counter, in_threads
 from wildgs.scene.alignment import align_world
 from wildgs.scene.colmap import ColmapImage, describe_names, read_model
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
+from wildgs.scene.depth_units import refuse_other_units
 from wildgs.scene.image_cache import DECODERS, ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.photo_store import ScenePhotos
@@ -82,7 +83,7 @@ def load_scene(
     _report_broken(broken, views, model.images_dir)
     _report_unused(photos)
     _report_blank(views, photos)
-    return Scene(
+    scene = Scene(
         root=root,
         views=tuple(views),
         points=alignment.apply_points(model.points).to(torch.float32),
@@ -90,6 +91,9 @@ def load_scene(
         alignment=alignment,
         observations=observations_of(model.observations, names, views),
     )
+    if config.use_depth and not lazy:
+        refuse_other_units(scene)
+    return scene
 
 
 def _report_unused(photos: ScenePhotos) -> None:

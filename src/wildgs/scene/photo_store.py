@@ -292,7 +292,9 @@ class ScenePhotos(PhotoStore):
             return None
         source = grid.source()
         depth = depth if source is None else sample_depth(depth, source)
-        return depth * np.float32(self.depth_scale)
+        with np.errstate(over="ignore"):
+            depth = depth * np.float32(self.depth_scale)
+        return np.where(np.isfinite(depth), depth, np.float32(0))
 
     def _read_prior(
         self, path: Path, grid: PixelGrid, read: Callable[[Path, tuple[int, int], int], _Values]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -27,6 +28,8 @@ SAME_POSE = 1e-3
 SAME_INTRINSICS = 0.01
 """Likewise for K, in pixels."""
 
+MAX_CAMERA_PIXELS = 10**9
+
 _FIELDS = ("viewmats", "K", "sizes", "is_test", "points", "point_colors", "observations")
 
 
@@ -46,6 +49,7 @@ class SceneRecord:
         alignment: From the model's frame to the aligned one.
         contents: Fingerprints of the files of each photo (`PhotoStore.fingerprint`); empty in records of earlier
             versions.
+        carried: Digests of the files in the run's `lights/` by their names; empty in records of earlier versions.
     """
 
     names: tuple[str, ...]
@@ -58,6 +62,7 @@ class SceneRecord:
     observations: Int[Tensor, "T 2"]
     alignment: Alignment
     contents: tuple[dict[str, str], ...] = ()
+    carried: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, scene: Scene) -> SceneRecord:
@@ -82,9 +87,9 @@ class SceneRecord:
         Raises:
             UserError: The file cannot be written.
         """
-        tensors = {field: getattr(self, field).contiguous() for field in _FIELDS}
+        tensors = {name: getattr(self, name).contiguous() for name in _FIELDS}
         header = {"format": FORMAT, "names": self.names, "alignment": self.alignment.to_dict()}
-        header["contents"] = self.contents
+        header |= {"contents": self.contents, "carried": self.carried}
         with written_aside(file, flush=True) as aside:
             try:
                 save_file(tensors, aside, metadata={"wildgs": json.dumps(header)})
@@ -102,17 +107,22 @@ class SceneRecord:
             check_regular(file)
             with safe_open(file, framework="pt") as opened:
                 header = json.loads((opened.metadata() or {})["wildgs"])
-                tensors = {field: opened.get_tensor(field).clone() for field in _FIELDS}
+                tensors = {name: opened.get_tensor(name).clone() for name in _FIELDS}
             if header["format"] != FORMAT:
-                raise ValueError(f"its format is {header['format']!r}")
+                raise ValueError(
+                    f"it is of another version of Wild-GS, with the format {header['format']!r:.40}"
+                )
             record = cls(
                 names=tuple(str(name) for name in header["names"]),
                 alignment=Alignment.from_dict(header["alignment"]),
                 contents=tuple(dict(entry) for entry in header.get("contents", ())),
+                carried={str(name): str(digest) for name, digest in header.get("carried", {}).items()},
                 **tensors,
             )
             record._check()
-        except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
+        except (
+            OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RecursionError
+        ) as error:  # fmt: skip
             raise UserError(
                 f"{file}: cannot be read as the scene of a run ({error}); copy the run folder again"
             ) from error
@@ -132,18 +142,26 @@ class SceneRecord:
             "point_colors": (points, 3),
             "observations": (len(self.observations), 2),
         }
-        for field, shape in shapes.items():
-            if tuple(getattr(self, field).shape) != tuple(shape):
-                raise ValueError(f"{field} has a wrong shape")
+        for name, shape in shapes.items():
+            if tuple(getattr(self, name).shape) != tuple(shape):
+                raise ValueError(f"{name} has a wrong shape")
         if views == 0 or len(set(self.names)) != views:
             raise ValueError("it names no photo, or one twice")
         limits = torch.tensor([views, points])
         if bool(((self.observations < 0) | (self.observations >= limits)).any()):
             raise ValueError("an observation is of no photo or point")
-        if not all(bool(getattr(self, field).isfinite().all()) for field in ("viewmats", "K", "points")):
+        if not all(bool(getattr(self, name).isfinite().all()) for name in ("viewmats", "K", "points")):
             raise ValueError("a camera or point is not finite")
+        turn, shift = self.alignment.rotation, self.alignment.translation
+        if (
+            not bool(turn.isfinite().all() and shift.isfinite().all())
+            or not 0 < self.alignment.scale < math.inf
+        ):
+            raise ValueError("its alignment is none")
         if bool((self.sizes < 1).any()) or bool((self.K[:, [0, 1], [0, 1]] <= 0).any()):
             raise ValueError("a camera has no size or focal length")
+        if bool((self.sizes.long().prod(dim=1) > MAX_CAMERA_PIXELS).any()):
+            raise ValueError("a camera has too many pixels")
 
     def camera(self, number: int) -> Camera:
         """The camera of a photo."""
@@ -211,7 +229,7 @@ class SceneRecord:
         found: dict[str, list[str]] = {}
         for name, then in zip(self.names, self.contents, strict=False):
             files = now[name].photos.fingerprint(name) if name in now and then else then
-            for what in ("content", "mask", "depth prior"):
+            for what in ("content", "mask", "depth prior", "metric depth"):
                 if files.get(what) != then.get(what):
                     found.setdefault(what, []).append(name)
         return [line for what, names in found.items() for line in _describe(f"with another {what}", names)]

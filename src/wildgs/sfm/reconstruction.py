@@ -167,7 +167,9 @@ def _writing(output: Path) -> Iterator[None]:
     """Reports a disk that is full or cannot be written to as a user's mistake."""
     try:
         yield
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "disk is full" not in str(error):  # so SQLite says it
+            raise
         raise UserError(
             f"{output} cannot be written ({error}); free disk space, fix permissions or choose another --output"
         ) from error

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from wildgs.files import printable
+from wildgs.files import printable, read_json
 from wildgs.scene.colmap import describe_names
 from wildgs.sfm.pairs import PairingName
 from wildgs.sfm.placement import Placement
@@ -123,12 +123,15 @@ def read_left_out(folder: Path) -> list[LeftOutPhoto]:
 def describe_placed(folder: Path) -> str:
     """A sentence on how the photos of a scene were placed, empty where its report does not say."""
     record = _read(folder)
-    placed, doubtful = record.get("placed", {}), record.get("doubtful", {})
-    if not placed or not isinstance(placed, dict):
+    try:
+        placed, doubtful = record["placed"], record.get("doubtful", {})
+        later = sum(how["placed_by"] != "first" for how in placed.values())
+        weakest = sorted(placed, key=lambda name: placed[name]["points"])[:3]
+        least = ", ".join(f"{printable(name)} ({placed[name]['points']} points)" for name in weakest)
+    except (KeyError, TypeError, AttributeError):  # of an earlier version, or damaged
         return ""
-    later = sum(how["placed_by"] != "first" for how in placed.values())
-    weakest = sorted(placed, key=lambda name: placed[name]["points"])[:3]
-    least = ", ".join(f"{printable(name)} ({placed[name]['points']} points)" for name in weakest)
+    if not placed:
+        return ""
     return (
         f"{len(placed)} photos have a pose, {later} of them by a second or third chance; {len(doubtful)} are"
         f" doubtful. The least sure: {least}."
@@ -137,7 +140,7 @@ def describe_placed(folder: Path) -> str:
 
 def _read(folder: Path) -> dict[str, Any]:
     try:
-        record = json.loads((folder / REPORT_NAME).read_text(encoding="utf-8"))
+        record = read_json(folder / REPORT_NAME)
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) else {}

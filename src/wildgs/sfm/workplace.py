@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import sqlite3
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -15,9 +16,10 @@ import filelock
 import pycolmap
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import is_file, written_aside
+from wildgs.files import is_file, read_json, written_aside
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.upright import WorkingCopy, list_photos
+from wildgs.version import __version__
 
 
 @dataclass(frozen=True)
@@ -53,23 +55,36 @@ class Workplace:
         folder.mkdir()
         return folder
 
+    def is_sound(self) -> bool:
+        """Whether the database can be read: COLMAP does not wait until it is on the disk, as a power cut shows."""
+        if not self.database.exists():
+            return True
+        try:
+            with closing(sqlite3.connect(self.database)) as opened:
+                return opened.execute("PRAGMA quick_check").fetchone() == ("ok",)
+        except sqlite3.Error:
+            return False
+
     def save_copies(self, copies: list[WorkingCopy], broken: dict[str, str]) -> None:
         """Records that all photos have been copied."""
-        record = {"copies": [asdict(copy) for copy in copies], "broken": broken}
+        sizes = [_sizes(self.images), _sizes(self.masks)]
+        record = {"copies": [asdict(copy) for copy in copies], "broken": broken, "sizes": sizes}
         with written_aside(self.root / "copies.json") as aside:
             aside.write_text(json.dumps(record), encoding="utf-8")
 
     def load_copies(self) -> tuple[list[WorkingCopy], dict[str, str]] | None:
         """The copies of an interrupted reconstruction, None where they are not complete."""
         try:
-            record = json.loads((self.root / "copies.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            record = read_json(self.root / "copies.json")
+            if record["sizes"] != [_sizes(self.images), _sizes(self.masks)]:
+                return None
+            copies = [
+                WorkingCopy(**{**copy, "position": copy["position"] and tuple(copy["position"])})
+                for copy in record["copies"]
+            ]
+            return copies, record["broken"]
+        except (OSError, ValueError, TypeError, KeyError):
             return None
-        copies = [
-            WorkingCopy(**{**copy, "position": copy["position"] and tuple(copy["position"])})
-            for copy in record["copies"]
-        ]
-        return copies, record["broken"]
 
     def is_done(self, stage: str) -> bool:
         """Whether a stage was finished, by this call or an interrupted one."""
@@ -86,14 +101,28 @@ class Workplace:
             (aside / str(number)).mkdir()
             model.write(aside / str(number))
         shutil.rmtree(self.root / name, ignore_errors=True)
+        with written_aside(self.root / f"{name}.json") as record:
+            record.write_text(json.dumps(_sizes(aside)), encoding="utf-8")
         aside.rename(self.root / name)
 
     def load_models(self, name: str) -> list[pycolmap.Reconstruction] | None:
         """The result of a stage of mapping that an interrupted reconstruction finished."""
         folder = self.root / name
-        if not folder.is_dir():
+        try:
+            if not folder.is_dir() or read_json(self.root / f"{name}.json") != _sizes(folder):
+                return None  # COLMAP takes a truncated model for a smaller one
+            return [pycolmap.Reconstruction(folder / str(n)) for n in range(len(list(folder.iterdir())))]
+        except (OSError, ValueError, RuntimeError):
             return None
-        return [pycolmap.Reconstruction(folder / str(n)) for n in range(len(list(folder.iterdir())))]
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Sizes of the files below a folder, which a full disk or a power cut would change."""
+    return {
+        path.relative_to(folder).as_posix(): path.stat().st_size
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def work_folder(output: Path) -> Path:
@@ -120,7 +149,12 @@ def open_workplace(photos: Path, output: Path, config: SfmConfig) -> Iterator[Wo
         ) from error
     try:
         plan = _plan(photos, config)
-        if not folder.is_dir() or _read(folder / "plan") != plan:
+        begun = folder.is_dir() and _read(folder / "plan") == plan
+        if begun and not Workplace(folder).is_sound():
+            begun = False
+            message = f"{folder}: what an interrupted call left there is damaged; beginning anew"
+            warnings.warn(message, WildGSWarning, stacklevel=3)
+        if not begun:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             (folder / "plan").write_text(plan, encoding="utf-8")
@@ -145,7 +179,7 @@ def _read(file: Path) -> str | None:
 
 def _plan(photos: Path, config: SfmConfig) -> str:
     """What the work depends on: options, pycolmap, and name, size and time of every photo."""
-    digest = hashlib.sha256(f"{pycolmap.__version__} {config}".encode())
+    digest = hashlib.sha256(f"{__version__} {pycolmap.__version__} {config}".encode())
     for name in list_photos(photos):
         stat = (photos / name).stat()
         digest.update(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\0".encode(errors="surrogateescape"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from jaxtyping import Float, Float32
 from PIL import Image
 from torch import Tensor
 
+from wildgs.errors import WildGSWarning
 from wildgs.files import written_aside
 from wildgs.priors.config import GroundConfig, StereoConfig
 from wildgs.priors.ground import find_ground
@@ -19,7 +21,7 @@ from wildgs.priors.stereo.neighbours import choose_neighbours, seen_rows
 from wildgs.priors.stereo.photos import Level, Planes
 from wildgs.priors.stereo.search import Search
 from wildgs.scene import Scene, load_scene
-from wildgs.scene.colmap import read_model
+from wildgs.scene.colmap import describe_names, read_model
 from wildgs.scene.config import DataConfig
 from wildgs.scene.photo_store import depth_files, metric_file
 from wildgs.scene.undistort import PixelGrid, sample_depth
@@ -149,6 +151,14 @@ def fill_metric_folder(
     if not wanted:
         return 0, kept
     depths = stereo_depth(scene, config, progress)
+    empty = [name for name in wanted if not depths[name].any()]
+    if empty:
+        warnings.warn(
+            f"{root}: other photos agree with {len(empty)} of {len(wanted)} photos nowhere, so they get no depth: "
+            f"{describe_names(empty)}",
+            WildGSWarning,
+            stacklevel=2,
+        )
     cameras = {image.name: image.camera for image in model.images}
     for name in wanted:
         depth = depths[name] / np.float32(scene.alignment.scale)
