@@ -56,7 +56,7 @@ FORWARD_STAGES = (
     ("sample and embed", "wildgs.model.wrapping.Wrapping.local_embeddings"),
     ("fuse", "wildgs.model.fusion.Fusion.forward"),
     ("harmonics to colours", "wildgs.model.method.sh_to_colors"),
-    ("rasterise for the match", "wildgs.model.photo_match.blend"),
+    ("rasterise for the match", "wildgs.model.photo_match.blend_sample"),
     ("rasterise (wildgs)", "wildgs.model.wildgs.blend"),
     ("rasterise (3dgs)", "wildgs.model.method.blend"),
     ("colour match", "wildgs.model.photo_match.match_photo"),

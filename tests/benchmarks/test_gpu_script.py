@@ -88,3 +88,16 @@ def test_an_unknown_stage_is_named(python: Path, tmp_path: Path):
     done = call(python, tmp_path, "--dry-run", "fly")
     assert done.returncode == 2
     assert "unknown stage fly" in done.stderr
+
+
+def test_where_gsplat_is_not_to_be_had_it_ends_at_once(tmp_path: Path):
+    """A Python with nothing in it, and no wheels for it."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "bare")], check=True)
+    (tmp_path / "wheels").mkdir()
+    command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), "--output", str(tmp_path / "out")]
+    command += ["--wheels", str(tmp_path / "wheels"), "install", "build"]
+    bare = {"PYTHON": str(tmp_path / "bare" / "bin" / "python"), "TORCH_CUDA_ARCH_LIST": "9.0"}
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | bare, timeout=60)
+    assert done.returncode == 1
+    assert "gsplat is missing and could not be installed" in done.stderr
+    assert len((tmp_path / "out" / "parts" / "stages.jsonl").read_text().splitlines()) == 1
