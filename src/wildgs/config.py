@@ -38,7 +38,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.density.max_gaussians": (1, _MOST),
     "train.density.grow_share": (0, 1),
     "train.density.grow_error": (0, _MOST),
-    "train.density.split_reach": (0, _MOST),
     "train.density.least_pixels": (0, _MOST),
     "train.dropout.rate": (0, 0.9),
     "train.dropout.neighbours": (1, 1024),

@@ -107,16 +107,16 @@ def test_oversized_and_broken_gaussians_go(method: VanillaGS) -> None:
 
 def test_what_fills_the_picture_goes_once_opacities_were_reset(method: VanillaGS) -> None:
     control, optimizers = controlled(method, [0.0] * 4)
-    control.reach = torch.tensor([0.1, 0.2, 0.0, 0.1])
+    control.largest = torch.tensor([0.1, 0.2, 0.0, 0.1])
     assert round_of(control, method, optimizers).pruned == 1, "the faint one"
-    control.reach = torch.tensor([0.1, 0.2, 0.1])
+    control.largest = torch.tensor([0.1, 0.2, 0.1])
     assert round_of(control, method, optimizers, large=True).pruned == 1
-    assert control.reach.tolist() == [0.0, 0.0]
+    assert control.largest.tolist() == [0.0, 0.0]
 
 
 def test_pruning_by_reach_can_be_switched_off(method: VanillaGS) -> None:
     control, optimizers = controlled(method, [0.0] * 4, prune_reach=0.0)
-    control.reach = torch.tensor([0.1, 0.9, 0.0, 0.1])
+    control.largest = torch.tensor([0.1, 0.9, 0.0, 0.1])
     assert round_of(control, method, optimizers, large=True).pruned == 1, "the faint one"
 
 
@@ -179,7 +179,7 @@ def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:
     expected = torch.where(projection.visible, torch.tensor([3.0 * 32, 4.0 * 16]).norm(), 0.0)
     torch.testing.assert_close(control.demand, expected)
     assert torch.equal(control.seen, projection.visible.float())
-    torch.testing.assert_close(control.reach, projection.radii / 64)
+    torch.testing.assert_close(control.largest, projection.radii / 64)
 
 
 def test_restored_statistics_are_where_the_gaussians_are() -> None:

@@ -15,7 +15,7 @@ from wildgs.model.vanilla import VanillaConfig, VanillaGS
 from wildgs.rasterize import blend
 
 SIDE = 32
-CONFIG = DensityConfig(max_gaussians=8, grow_share=0.25, grow_error=0.0, split_reach=10.0)
+CONFIG = DensityConfig(max_gaussians=8, grow_share=0.25, grow_error=0.0)
 
 
 @pytest.fixture
@@ -65,10 +65,10 @@ def test_what_a_view_says(method: VanillaGS) -> None:
     weight = torch.autograd.functional.jacobian(
         lambda values: blend(method.gaussians.project(camera()), values[:, None]).colors.sum(), torch.ones(5)
     )
-    torch.testing.assert_close(found.pixels, weight)
+    torch.testing.assert_close(found.largest, weight)
     torch.testing.assert_close(found.demand[0], 0.5 * weight[0], rtol=1e-3, atol=0)
     skipped = control.measure(view_of(method, UPPER_LEFT), torch.tensor(False))
-    assert not torch.cat([skipped.demand, skipped.seen, skipped.pixels]).any()
+    assert not torch.cat([skipped.demand, skipped.seen, skipped.largest]).any()
 
 
 def test_pixels_that_do_not_count_are_no_error(method: VanillaGS) -> None:
@@ -91,21 +91,6 @@ def test_the_wrong_one_splits_along_its_longest_axis(method: VanillaGS) -> None:
     assert (halves[0] - halves[1]).abs().argmax() == 0
     assert moved[-1, 0] == pytest.approx(0.65 * 0.3, rel=0.02)
     assert moved[-1, 1] == pytest.approx(0.9 * 0.2, rel=0.02)
-
-
-def test_what_is_too_large_on_a_photo_is_split_first(method: VanillaGS) -> None:
-    """On any step, surveyed or not."""
-    with torch.no_grad():
-        method.gaussians.rows["log_scales"][0] += 0.7
-    control = RelocationDensity(replace(CONFIG, split_reach=0.5, grow_error=1e3), 1.0, 5)
-    view = view_of(method, LOWER_RIGHT)
-    control.gather(replace(view, surveyed=False))
-    assert not torch.cat([control.demand, control.seen, control.pixels]).any()
-    assert (control.reach > 0.5).tolist() == [True, False, False, False, False]
-    assert round_of(control, method).split == 1
-    torch.testing.assert_close(
-        method.gaussians.means.detach()[-2:].mean(dim=0), torch.tensor([-1.0, -1, 0]), atol=1e-2, rtol=0
-    )
 
 
 def test_what_shows_nothing_makes_room(method: VanillaGS) -> None:
@@ -136,9 +121,9 @@ def test_small_errors_split_nothing_and_what_may_not_grow_stays(method: VanillaG
 def test_what_is_known_moves_with_the_gaussians_and_through_a_checkpoint(method: VanillaGS) -> None:
     control = RelocationDensity(CONFIG, 1.0, 5)
     control.gather(view_of(method, LOWER_RIGHT))
-    before = control.pixels.clone()
+    before = control.largest.clone()
     round_of(control, method)
-    torch.testing.assert_close(control.pixels, torch.cat([0.8 * before[[0, 1, 2, 4]], torch.zeros(2)]))
+    torch.testing.assert_close(control.largest, torch.cat([0.8 * before[[0, 1, 2, 4]], torch.zeros(2)]))
     assert control.known.tolist() == [1, 1, 1, 1, 0, 0]
     control.gather(view_of(method, LOWER_RIGHT))
     other = RelocationDensity(CONFIG, 1.0, 0)

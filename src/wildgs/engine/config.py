@@ -100,7 +100,6 @@ class DensityConfig:
         grow_share: Of relocation: share of the Gaussians that one round splits, and that it takes away, at most.
         grow_error: Of relocation: error that a Gaussian covers, below which it is not split; pixels times error,
             mean over the photos that see it.
-        split_reach: Of relocation: Gaussians that reach further than this share of a photo's longer side are split.
         least_pixels: Of relocation: Gaussians that cover fewer pixels of any photo go.
         max_gaussians: Upper bound on the number of Gaussians, from the start.
     """
@@ -116,7 +115,6 @@ class DensityConfig:
     reset_unseen: bool = False
     grow_share: float = 0.1
     grow_error: float = 0.02
-    split_reach: float = 0.2
     least_pixels: float = 1.0
     max_gaussians: int = 3_000_000
 

@@ -191,11 +191,11 @@ class Ranks(Team):
 
     def pool(self, statistics: ViewStatistics) -> ViewStatistics:  # noqa: D102 - as in Team
         sums = torch.stack([statistics.demand, statistics.seen])
-        largest = torch.stack([statistics.reach, statistics.pixels])
+        largest = statistics.largest.clone()
         with _peers():
             sum_over_ranks([sums])
             dist.all_reduce(largest, op=dist.ReduceOp.MAX)
-        return ViewStatistics(*sums, *largest)
+        return ViewStatistics(demand=sums[0], seen=sums[1], largest=largest)
 
     def _gather(self, value: Any) -> list[Any]:
         gathered: list[Any] = [None] * self.size

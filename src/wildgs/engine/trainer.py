@@ -13,7 +13,7 @@ from torch import Tensor
 
 from wildgs import features
 from wildgs.engine.config import TrainConfig
-from wildgs.engine.density import STRATEGIES, SURVEY_EVERY, DensityReport, SeenView
+from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.process_settings import ProcessSettings
@@ -183,9 +183,7 @@ class Trainer:
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
         output, losses = self._forward(view, photo, keep)
-        surveyed = self.step // self.team.size % SURVEY_EVERY == 0
-        counts = self._counting(output, keep)
-        seen = SeenView(output.projection, output.rendering.colors, photo, counts, surveyed)
+        seen = SeenView(output.projection, output.rendering.colors, photo, self._counting(output, keep))
         skipped = self._report_marked()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
@@ -210,7 +208,7 @@ class Trainer:
 
     def _take(self, seen: SeenView, losses: Losses) -> str | None:
         """Lets the optimisers take the step unless it is not finite; why it was skipped, where that is known."""
-        gathers = self.schedule.gathers(self.step)
+        gathers = self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size)
         if self.skips_on_device:
             faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
             if gathers:

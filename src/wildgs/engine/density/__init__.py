@@ -1,13 +1,7 @@
 """Density control: which Gaussians are added and taken away in training; a file for each strategy."""
 
 from wildgs.engine.density.classic import AbsGradDensity, ClassicDensity
-from wildgs.engine.density.control import (
-    SURVEY_EVERY,
-    DensityControl,
-    DensityReport,
-    SeenView,
-    ViewStatistics,
-)
+from wildgs.engine.density.control import DensityControl, DensityReport, SeenView, ViewStatistics
 from wildgs.engine.density.relocation import RelocationDensity
 
 STRATEGIES: dict[str, type[DensityControl]] = {
@@ -19,7 +13,6 @@ STRATEGIES: dict[str, type[DensityControl]] = {
 
 __all__ = [
     "STRATEGIES",
-    "SURVEY_EVERY",
     "AbsGradDensity",
     "ClassicDensity",
     "DensityControl",

@@ -29,7 +29,7 @@ class ClassicDensity(DensityControl):
         gradient = projection.absgrad if self.absgrad else projection.means2d.grad
         if gradient is None:
             zeros = torch.zeros_like(projection.means2d[:, 0])
-            return ViewStatistics(zeros, zeros, zeros, zeros)
+            return ViewStatistics(zeros, zeros, zeros)
         camera = projection.camera
         x, y = gradient.unbind(1)
         norm = torch.hypot(x * (camera.width / 2), y * (camera.height / 2))
@@ -37,8 +37,7 @@ class ClassicDensity(DensityControl):
         return ViewStatistics(
             demand=torch.where(visible, norm, 0.0),
             seen=visible.to(norm),
-            reach=self._reach(projection, visible),
-            pixels=torch.zeros_like(norm),
+            largest=torch.where(visible, projection.radii / max(camera.width, camera.height), 0.0),
         )
 
     @torch.no_grad()
@@ -85,7 +84,7 @@ class ClassicDensity(DensityControl):
             allowed = distance.clamp_min(self.extent)
         large = largest > self.config.prune_scale * allowed
         if self.config.prune_reach > 0:
-            large = large | (self.reach > self.config.prune_reach)
+            large = large | (self.largest > self.config.prune_reach)
         return large
 
     def _select_growing(self, growable: Bool[Tensor, "N"] | None) -> Bool[Tensor, "N"]:

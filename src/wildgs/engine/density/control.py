@@ -15,9 +15,6 @@ from wildgs.engine.optimizers import edit_rows, reset_moments
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Projection
 
-SURVEY_EVERY = 7
-"""Steps; prime to the rhythms of training, so that no part of a schedule is always surveyed."""
-
 
 @dataclass(frozen=True)
 class ViewStatistics:
@@ -27,14 +24,12 @@ class ViewStatistics:
         demand: How much they ask for more Gaussians in its place, added up over the views; what is measured is the
             strategy's.
         seen: How many views see it.
-        reach: Its largest radius, as a share of a picture's longer side.
-        pixels: Of how many pixels it is, at most; 0 where that is not measured.
+        largest: The largest of what the strategy measures beside that.
     """
 
     demand: Float[Tensor, "N"]
     seen: Float[Tensor, "N"]
-    reach: Float[Tensor, "N"]
-    pixels: Float[Tensor, "N"]
+    largest: Float[Tensor, "N"]
 
 
 @dataclass(frozen=True)
@@ -55,14 +50,12 @@ class SeenView:
         colors: The render.
         photo: RGB in [0, 1].
         counts: Which pixels of the photo count: neither transient nor masked by the user; None for all.
-        surveyed: Whether this is one of the steps (one in `SURVEY_EVERY`) for measures that cost time.
     """
 
     projection: Projection
     colors: Float[Tensor, "H W 3"]
     photo: Float[Tensor, "H W 3"]
     counts: Bool[Tensor, "H W"] | None = None
-    surveyed: bool = True
 
     @property
     def error(self) -> Float[Tensor, "H W"]:
@@ -98,20 +91,22 @@ class DensityControl(ABC):
         self._clear(num_gaussians)
 
     def _clear(self, num_gaussians: int) -> None:
-        self.demand, self.seen, self.reach, self.pixels = torch.zeros(4, num_gaussians, device=self.device)
+        self.demand = torch.zeros(num_gaussians, device=self.device)
+        self.seen = torch.zeros(num_gaussians, device=self.device)
+        self.largest = torch.zeros(num_gaussians, device=self.device)
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs; names are those of checkpoints."""
-        return {"gradient_sum": self.demand, "seen": self.seen, "reach": self.reach, "pixels": self.pixels}
+        return {"gradient_sum": self.demand, "seen": self.seen, "reach": self.largest}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Continues where `state` was taken."""
-        # Runs of earlier versions have no pixels.
-        none = torch.zeros_like(state["reach"])
-        names = ("gradient_sum", "seen", "reach", "pixels")
-        self.demand, self.seen, self.reach, self.pixels = (
-            state.get(name, none).to(self.device) for name in names
-        )
+        names = ("gradient_sum", "seen", "reach")
+        self.demand, self.seen, self.largest = (state[name].to(self.device) for name in names)
+
+    def measures(self, step: int) -> bool:
+        """Whether the strategy reads this step."""
+        return True
 
     @abstractmethod
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
@@ -164,8 +159,7 @@ class DensityControl(ABC):
             statistics = pool(statistics)
         self.demand = self.demand + statistics.demand
         self.seen = self.seen + statistics.seen
-        self.reach = torch.maximum(self.reach, statistics.reach)
-        self.pixels = torch.maximum(self.pixels, statistics.pixels)
+        self.largest = torch.maximum(self.largest, statistics.largest)
 
     @torch.no_grad()
     def shrink(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, budget: int) -> int:
@@ -203,12 +197,6 @@ class DensityControl(ABC):
             lowered = torch.where(growable, lowered, logits)
         logits.copy_(lowered)
         reset_moments(optimizer, gaussians, "opacity_logits")
-
-    @staticmethod
-    def _reach(projection: Projection, visible: Bool[Tensor, "N"]) -> Float[Tensor, "N"]:
-        """Radii as a share of the picture's longer side."""
-        longer = max(projection.camera.width, projection.camera.height)
-        return torch.where(visible, projection.radii / longer, 0.0)
 
     @staticmethod
     def _broken(gaussians: Gaussians) -> Bool[Tensor, "N"]:

@@ -21,6 +21,8 @@ from wildgs.geometry.rotation import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Projection, blend
 
+MEASURE_EVERY = 7
+"""Steps; each of those costs one more blend of two channels."""
 LEAST_VIEWS = 2
 """Before a Gaussian that shows nothing may go."""
 MEMORY = 0.8
@@ -47,27 +49,23 @@ class RelocationDensity(DensityControl):
         super().restore(state)
         self.known = state["known"].to(self.device) - self.seen
 
-    def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
-        """Error that each Gaussian covers, in pixels times error, and how many pixels it shows, of surveyed steps.
+    def measures(self, step: int) -> bool:
+        """Every seventh step."""
+        return step % MEASURE_EVERY == 0
 
-        That costs one more blend of two channels.
-        """
-        visible = view.projection.visible if sound is None else view.projection.visible & sound
-        reach = self._reach(view.projection, visible)
-        if not view.surveyed:
-            nothing = torch.zeros_like(reach)
-            return ViewStatistics(nothing, nothing, reach, nothing)
+    def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
+        """Error that each Gaussian covers, in pixels times error, and how many pixels it shows."""
         values = view.projection.means2d.new_ones(len(view.projection.means2d), 2, requires_grad=True)
         with torch.enable_grad():
             shown = blend(_detached(view.projection), values, depth=False).colors
         error = view.error
         weights = torch.stack([error, torch.ones_like(error)], dim=-1)
         covered, pixels = torch.autograd.grad(shown, values, weights)[0].unbind(1)
+        visible = view.projection.visible if sound is None else view.projection.visible & sound
         return ViewStatistics(
             demand=torch.where(visible, covered, 0.0),
             seen=visible.to(covered),
-            reach=reach,
-            pixels=torch.where(visible, pixels, 0.0),
+            largest=torch.where(visible, pixels, 0.0),
         )
 
     @torch.no_grad()
@@ -102,23 +100,18 @@ class RelocationDensity(DensityControl):
         gone = gone | self._broken(gaussians)
         hidden = (
             (self.known + self.seen >= LEAST_VIEWS)
-            & (self.pixels < self.config.least_pixels)
+            & (self.largest < self.config.least_pixels)
             & ~fixed
             & ~gone
         )
-        least = torch.where(hidden, self.pixels, torch.inf).argsort()[: min(most, int(hidden.sum()))]
+        least = torch.where(hidden, self.largest, torch.inf).argsort()[: min(most, int(hidden.sum()))]
         gone[least] = True
         return gone
 
     def _select_wrong(self, excluded: Bool[Tensor, "N"], most: int) -> Int[Tensor, " S"]:
-        """Those that are too large on a photo, then those that cover most error, and enough of it in a view.
-
-        A large disc of ground at a photographer's feet is smeared over the picture, since it is projected as if it
-        were small.
-        """
+        """Those that cover most error, and enough of it in the views that see them."""
         enough = self.demand > self.config.grow_error * self.seen.clamp_min(1)
         demand = torch.where(enough & ~excluded, self.demand, 0.0)
-        demand = torch.where((self.reach > self.config.split_reach) & ~excluded, torch.inf, demand)
         chosen = demand.topk(min(max(most, 0), len(demand))).indices
         return chosen[demand[chosen] > 0]
 
@@ -137,12 +130,12 @@ class RelocationDensity(DensityControl):
 
     def _remember(self, source: Int[Tensor, " M"]) -> None:
         """Carries what Gaussians showed over to their new places; of new ones nothing is known."""
-        known, pixels = (
+        known, largest = (
             torch.where(source >= 0, value[source.clamp_min(0)], 0.0)
-            for value in (self.known + self.seen, MEMORY * self.pixels)
+            for value in (self.known + self.seen, MEMORY * self.largest)
         )
         self._clear(len(source))
-        self.known, self.pixels = known, pixels
+        self.known, self.largest = known, largest
 
 
 def _detached(projection: Projection) -> Projection:
