@@ -397,7 +397,7 @@ def test_appearances(fault: str, method: WildGS, tmp_path: Path, monkeypatch) ->
 @pytest.mark.parametrize("fault", [f for i, f in EXISTING if i == "camera file"])
 def test_camera_files(fault: str, tmp_path: Path, monkeypatch) -> None:
     kind, pattern, _ = table.TABLE["camera file"][fault]
-    cameras = [Camera(torch.eye(4), 30 * torch.eye(3), 48, 32) for _ in range(3)]
+    cameras = [Camera(torch.eye(4), torch.diag(torch.tensor([30.0, 30.0, 1.0])), 48, 32) for _ in range(3)]
     file = tmp_path / ("ü 写真 2.json" if fault == "names" else "path.json")
     write_camera_path(file, cameras, fps=24.0)
     content = json.loads(file.read_text())
