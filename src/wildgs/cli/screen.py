@@ -158,7 +158,7 @@ class Screen:
             self._bar = _bar()
             self._task = self._bar.add_task(stage, total=total or None, completed=done, detail="")
             self._bar.start()
-        elif stage.startswith("training"):
+        elif stage.startswith("training") and done < total:
             console.print(f"{stage}: {total - done} steps")
 
     def _line(self, done: int, total: int) -> None:
