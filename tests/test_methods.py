@@ -86,13 +86,12 @@ def test_what_it_declares_is_what_it_has(trained: Trainer) -> None:
     assert sorted(grouped) == sorted({id(p) for p in method.parameters()} - rows)
 
 
-def test_training_changes_the_number_of_gaussians_within_the_budget(trained: Trainer, scene: Scene) -> None:
+def test_training_grows_within_the_budget(trained: Trainer, scene: Scene) -> None:
     start = create_method(trained.method.name, trained.method.config, scene, max_gaussians=1000)
-    assert 0 < len(trained.method.gaussians) <= 1000
-    if trained.method.density == "classic":
-        assert len(start.gaussians) < len(trained.method.gaussians)
-    else:  # which also takes away
-        assert len(start.gaussians) != len(trained.method.gaussians)
+    assert len(trained.method.gaussians) <= 1000
+    # The strategy relocation may take away as many as it adds.
+    relocates = trained.method.density == "relocation"
+    assert len(start.gaussians) < len(trained.method.gaussians) + relocates
 
 
 def test_it_comes_back_from_its_state_and_goes_on_in_the_same_bits(trained: Trainer, scene: Scene) -> None:

@@ -70,6 +70,7 @@ def tower() -> tuple[WildGS, Camera]:
     x, z = torch.meshgrid(torch.linspace(-0.5, 0.5, 30), torch.linspace(-1, 1, 60), indexing="ij")
     points = torch.stack([x, torch.full_like(x, 1.0), z], dim=-1).reshape(-1, 3)
     config = WildGSConfig(
+        eps2d=0.3,  # Gaussians a pixel apart, which are not trained, would let the sky through with less
         parsing=ParsingConfig(max_side=64),
         wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8), crop_ratio=1.0),
         sky=SkyConfig(points=3000),
