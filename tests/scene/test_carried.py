@@ -183,6 +183,7 @@ def test_a_record_cut_short_is_one_line(scene: Scene, tmp_path: Path, keep: int)
         {"sizes": torch.zeros(9, 2, dtype=torch.int32)},
         {"alignment": replace(Alignment.identity(), scale=float("nan"))},
         {"sizes": torch.full((9, 2), 10**6, dtype=torch.int32)},
+        {"sizes": torch.tensor([[2**23 + 48, 32]] * 9, dtype=torch.int32)},
     ],
 )
 def test_a_record_that_makes_no_sense_is_one_line(scene: Scene, tmp_path: Path, change) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from wildgs.errors import UserError
 from wildgs.files import check_regular, written_aside
 from wildgs.geometry.camera import Camera
+from wildgs.scene.colmap_records import MAX_CAMERA_SIDE
 from wildgs.scene.photo_store import PhotoStore
 from wildgs.scene.scene import Alignment, Scene, View, observations_of
 
@@ -162,6 +163,8 @@ class SceneRecord:
             raise ValueError("a camera has no size or focal length")
         if bool((self.sizes.long().prod(dim=1) > MAX_CAMERA_PIXELS).any()):
             raise ValueError("a camera has too many pixels")
+        if bool((self.sizes > MAX_CAMERA_SIDE).any()):  # to which its small photo would be enlarged
+            raise ValueError(f"a camera is over {MAX_CAMERA_SIDE:,} pixels wide or high")
 
     def camera(self, number: int) -> Camera:
         """The camera of a photo."""
