@@ -183,7 +183,9 @@ class Trainer:
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
         output, losses = self._forward(view, photo, keep)
-        seen = SeenView(output.projection, output.rendering.colors, photo, self._counting(output, keep))
+        seen = None
+        if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
+            seen = SeenView(output.projection, output.rendering.colors, photo, self._counting(output, keep))
         skipped = self._report_marked()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
@@ -206,18 +208,17 @@ class Trainer:
             taken=taken,
         )
 
-    def _take(self, seen: SeenView, losses: Losses) -> str | None:
+    def _take(self, seen: SeenView | None, losses: Losses) -> str | None:
         """Lets the optimisers take the step unless it is not finite; why it was skipped, where that is known."""
-        gathers = self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size)
         if self.skips_on_device:
             faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
-            if gathers:
+            if seen is not None:
                 self.density.gather(seen, self.team.pool, faulty == 0)
             self.optimizers.step(faulty)
             return None
         fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
         if fault is None:
-            if gathers:
+            if seen is not None:
                 self.density.gather(seen, self.team.pool)
             self.optimizers.step()
         else:
