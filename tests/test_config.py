@@ -28,7 +28,7 @@ def test_changes_what_it_names_and_nothing_else():
     ("entries", "said"),
     [
         ({"train.optimiser.networks": 1.0}, "unknown entry 'optimiser'"),
-        ({"train.optimizer.mean": 1.0}, "known are"),
+        ({"train.optimizer.mean": 1.0}, "choose from"),
         ({"train.steps": "many"}, "config.train.steps: 'many' is not a int"),
         ({"train.steps.more": 1}, "steps is a value"),
         ({"method": "nerf"}, "config.method"),

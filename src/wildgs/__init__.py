@@ -1,7 +1,7 @@
 """Wild-GS: relightable 3D Gaussian scenes from unconstrained photo collections.
 
-Every verb of the command line is a function of this package (docs/python.md); all names are imported when they are
-first asked for, so that `import wildgs` waits for nothing.
+Every verb of the command line is a function of this package (docs/python.md). All names are imported lazily, so that
+`import wildgs` is fast.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """The Python API, imported when it is first asked for."""
+    """Imports a name of the Python API at its first use."""
     if name not in _MODULES:
         raise AttributeError(f"module 'wildgs' has no attribute {name!r}")
     return getattr(importlib.import_module(f"wildgs.{_MODULES[name]}"), name)

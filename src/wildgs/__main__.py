@@ -1,4 +1,4 @@
-"""`python -m wildgs`: the command line, as torchrun starts it."""
+"""`python -m wildgs`: the command line, also for `torchrun -m wildgs`."""
 
 from wildgs.cli import main
 

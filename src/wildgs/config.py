@@ -1,4 +1,4 @@
-"""The configuration of a run: one dataclass of those of all packages, read and written as YAML."""
+"""The configuration of a run, composed of the packages' dataclasses, and its YAML file."""
 
 from __future__ import annotations
 
@@ -23,22 +23,21 @@ from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
 MAX_CONFIG_BYTES = 1_000_000
 
-
 _BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
-"""First and last line: a truncated file could still be valid YAML, with defaults for what is missing."""
-_MOST = 1e9
+"""First and last line, to detect truncation: a truncated file could still be valid YAML with entries missing."""
+_MAX_VALUE = 1e9
 _RANGES: dict[str, tuple[float, float]] = {
     "data.downscale": (1, 1000),
     "data.max_image_pixels": (1, 1e12),
     "train.seed": (0, 2**63 - 1),
     "train.objective.weight_l1": (0, 1),
-    "train.optimizer.means": (1e-12, _MOST),
+    "train.optimizer.means": (1e-12, _MAX_VALUE),
     "train.optimizer.short_runs": (0, 1),
     "train.density.reset_opacity": (1e-6, 1),
-    "train.density.max_gaussians": (1, _MOST),
+    "train.density.max_gaussians": (1, _MAX_VALUE),
     "train.density.grow_share": (0, 1),
-    "train.density.grow_error": (0, _MOST),
-    "train.density.least_pixels": (0, _MOST),
+    "train.density.grow_error": (0, _MAX_VALUE),
+    "train.density.least_pixels": (0, _MAX_VALUE),
     "train.dropout.rate": (0, 0.9),
     "train.dropout.neighbours": (1, 1024),
     "model.mask_threshold": (0, 1),
@@ -64,25 +63,25 @@ _RANGES: dict[str, tuple[float, float]] = {
     "model.sky.lowest": (-90, 89),
     "model.sky.opacity": (1e-6, 0.999999),
 }
-"""Least and greatest value of entries that cannot take every number from 0 to `_MOST`."""
+"""Smallest and largest value of numeric entries; those not listed range from 0 to `_MAX_VALUE`."""
 _MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
-"""Entries of earlier versions' `config.yaml` that belong to `ExecutionConfig` now."""
+"""Entries of earlier versions' `config.yaml` that are part of `ExecutionConfig` now."""
 
 
 @dataclass(frozen=True)
 class ExecutionConfig:
-    """How work is executed: without influence on the outcome, so that it may change when a run is resumed.
+    """How training is executed. These options do not affect the result and may change when a run is resumed.
 
     Attributes:
-        image_cache: Memory for decoded photos; photos beyond it are decoded again when their turn comes.
+        image_cache: Memory for decoded photos; photos that do not fit are decoded again at every use.
         checkpoint_every: Steps between checkpoints.
-        checkpoint_minutes: Minutes between checkpoints; whichever comes first.
-        log_every: Steps between entries of metrics.jsonl and tensorboard.
-        pictures_every: Steps between pictures on tensorboard.
-        cuda_graphs: Record and replay networks as CUDA graphs, where there is CUDA.
-        feature_cache: Memory for the features that the frozen encoder gave of training photos; those of photos
-            beyond it are computed again when their turn comes.
-        threads: CPU threads of kernels and torch; by default WILDGS_NUM_THREADS, or all cores.
+        checkpoint_minutes: Largest time between checkpoints, in minutes.
+        log_every: Steps between entries of metrics.jsonl and TensorBoard.
+        pictures_every: Steps between images on TensorBoard.
+        cuda_graphs: Capture and replay the networks as CUDA graphs (on CUDA devices).
+        feature_cache: Memory for the frozen encoder's features of training photos; those of photos that do not fit are
+            computed again at every use.
+        threads: Number of CPU threads of kernels and torch. Default: WILDGS_NUM_THREADS, else all cores.
     """
 
     image_cache: str = IMAGE_CACHE
@@ -95,7 +94,7 @@ class ExecutionConfig:
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        """Checks the values."""
+        """Validates the values."""
         parse_bytes(self.image_cache)
         parse_bytes(self.feature_cache)
         for name in ("checkpoint_every", "checkpoint_minutes", "log_every", "pictures_every", "threads"):
@@ -106,13 +105,13 @@ class ExecutionConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What decides a run's outcome.
+    """Everything that affects the result of a run.
 
     Attributes:
-        scene: The scene folder at the time of training; not compared between configurations.
+        scene: The scene folder at the time of training; ignored when configurations are compared.
         method: A name in `wildgs.model.registry.METHODS`.
         data: How the scene is read.
-        model: The method's own options, an instance of its `Config`; None takes the defaults.
+        model: The method's options, an instance of its `Config`; None = defaults.
         train: Training.
     """
 
@@ -123,7 +122,12 @@ class RunConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def __post_init__(self) -> None:
-        """Fills in the method's default options; those of another method are an error."""
+        """Sets the method's default options if none are given, and validates all values.
+
+        Raises:
+            TypeError: `model` holds the options of another method.
+            UserError: A value is out of range.
+        """
         kind = config_type(self.method)
         if self.model is None:
             object.__setattr__(self, "model", kind())
@@ -132,17 +136,17 @@ class RunConfig:
                 f"method {self.method} takes a {kind.__name__}, not a {type(self.model).__name__}"
             )
         for path, value in _flat(to_plain(self)).items():
-            least, most = _RANGES.get(path.replace("model.initial.", "model."), (0, _MOST))
-            if isinstance(value, int | float) and not least <= value <= most:  # NaN neither
+            least, most = _RANGES.get(path.replace("model.initial.", "model."), (0, _MAX_VALUE))
+            if isinstance(value, int | float) and not least <= value <= most:  # also rejects NaN
                 raise UserError(f"{path} {value}: must be from {least:g} to {most:g}")
 
     def with_method(self, method: MethodName) -> RunConfig:
-        """The same run by another method, with that method's default options."""
+        """The configuration with another method and that method's default options."""
         return self if method == self.method else dataclasses.replace(self, method=method, model=None)
 
 
 def to_plain(value: Any) -> Any:
-    """A configuration as dicts, lists, strings and numbers."""
+    """Converts a configuration to dicts, lists, strings and numbers."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, (tuple, list)):
@@ -153,9 +157,13 @@ def to_plain(value: Any) -> Any:
 def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
     """The inverse of `to_plain`; missing entries take their defaults.
 
+    Args:
+        kind: Type to convert to.
+        value: Plain value.
+        where: Path of the entry, for messages.
+
     Raises:
-        UserError: An entry of `where` is unknown or of the wrong type. Values in messages are shortened
-            (`reprlib`).
+        UserError: An entry is unknown or has the wrong type.
     """
     if dataclasses.is_dataclass(kind):
         return _dataclass_from_plain(kind, value, where)
@@ -172,7 +180,7 @@ def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
         return Path(value)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if isinstance(kind, type) and type(value) is kind and value == value:  # NaN is nothing
+    if isinstance(kind, type) and type(value) is kind and value == value:  # rejects NaN
         return value
     raise UserError(f"{where}: {reprlib.repr(value)} is not a {getattr(kind, '__name__', kind)}")
 
@@ -190,10 +198,10 @@ def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
         hints["model"] = config_type(_method_of(value))
     known = {f.name for f in dataclasses.fields(kind)}
     if unknown := sorted(map(str, set(value) - known)):
-        raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; known are {', '.join(sorted(known))}")
+        raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; choose from {', '.join(sorted(known))}")
     required = {f.name for f in dataclasses.fields(kind) if _is_required(f)}
-    if lacking := sorted(required - set(value)):
-        raise UserError(f"{where}: the entry {lacking[0]!r} is missing")
+    if missing := sorted(required - set(value)):
+        raise UserError(f"{where}: the entry {missing[0]!r} is missing")
     return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
 
 
@@ -204,10 +212,9 @@ def _method_of(plain: dict[Any, Any]) -> str:
 _MOVED_RATES = {name: name for name in ("intrinsic", "networks", "encoder", "sh0", "shN")} | {
     "network_decay": "decay"
 }
-"""From entries of `train.optimizer` in earlier versions to those of `model.learning_rates`."""
+"""Entries of `train.optimizer` in earlier versions -> entries of `model.learning_rates` now."""
 
-
-_BEFORE: dict[tuple[str, ...], tuple[str, Any]] = {
+_EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "matched_loss"): ("color_match", 0.0),
     ("model", "light_codes"): ("color_match", 0),
     ("model", "light_components"): ("color_match", 0),
@@ -219,29 +226,28 @@ _BEFORE: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "schedule", "planes_every"): ("mask_pause", 1),
     ("train", "density", "strategy"): ("split_scale", "classic"),
 }
-"""Entries that earlier versions' `config.yaml` does not have: an entry beside them that it does have, and the value
-with which a run that began so continues."""
+"""Entries that were added later: path -> (a sibling by which an older file is recognised, the older behaviour)."""
 
 
-def _as_before(plain: dict[Any, Any]) -> dict[Any, Any]:
-    """The configuration of an earlier version's run, with what it did where there was no entry for it."""
+def _with_earlier_defaults(plain: dict[Any, Any]) -> dict[Any, Any]:
+    """Adds missing entries to an earlier version's configuration, with values that keep its behaviour."""
     plain = copy.deepcopy(plain)
-    for (*parents, name), (beside, value) in _BEFORE.items():
+    for (*parents, name), (sibling, value) in _EARLIER_DEFAULTS.items():
         entries: Any = plain
         for parent in parents:
             entries = entries.get(parent) if isinstance(entries, dict) else None
-        if isinstance(entries, dict) and beside in entries:
+        if isinstance(entries, dict) and sibling in entries:
             entries.setdefault(name, value)
     return plain
 
 
 def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
-    """A run's configuration as an earlier version wrote it, in today's form.
+    """Converts the configuration of an earlier version's run to the current form.
 
-    Learning rates of a method's own parameters were entries of `train.optimizer`, every method carried the default
-    method's options, and `train.objective` repeated the mask's threshold.
+    Learning rates of a method's own parameters were entries of `train.optimizer`, every method had the default
+    method's options, and `train.objective` repeated the mask threshold.
     """
-    plain = _as_before(plain)
+    plain = _with_earlier_defaults(plain)
     known = _entries(config_type(_method_of(plain)))
     model = plain.get("model")
     if isinstance(model, dict):
@@ -263,7 +269,7 @@ def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _entries(kind: Any) -> dict[str, Any]:
-    """Names and types of a dataclass's entries."""
+    """Names and types of a dataclass's fields."""
     hints = typing.get_type_hints(kind)
     return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
 
@@ -280,11 +286,14 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return from_plain(kind, value, where)
         except UserError:
             continue
-    raise UserError(f"{where}: {reprlib.repr(value)} fits none of {kinds}")
+    names = " or ".join(
+        "None" if kind is type(None) else getattr(kind, "__name__", str(kind)) for kind in kinds
+    )
+    raise UserError(f"{where}: {reprlib.repr(value)} is not of type {names}")
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain data without aliases, by which a small file can expand to more than memory holds."""
+    """Loads plain data and rejects aliases, with which a small file can expand beyond the memory."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -297,7 +306,7 @@ def write_config(path: Path, config: RunConfig) -> None:
     """Writes YAML atomically.
 
     Raises:
-        UserError: The disk is full, or the folder cannot be written to.
+        UserError: The file cannot be written.
     """
     with written_aside(path, flush=True) as aside, aside.open("w", encoding="utf-8") as file:
         file.write(f"{_BEGIN}\n")
@@ -309,17 +318,19 @@ def read_config(path: Path) -> RunConfig:
     """Reads YAML.
 
     Raises:
-        UserError: The file is missing, no YAML, or no run configuration.
+        UserError: The file is missing, not YAML, or not the configuration of a run.
     """
     try:
         check_regular(path)
         if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise UserError(f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is no run's configuration")
+            raise UserError(
+                f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is not a run's configuration"
+            )
         text = path.read_text(encoding="utf-8")
         if text.startswith(_BEGIN) and _END not in text.splitlines():
-            raise UserError(f"{path} is cut off: the line {_END!r} is missing; restore it from a copy")
+            raise UserError(f"{path} is truncated: the line {_END!r} is missing; restore it from a copy")
         plain = yaml.load(text, _Loader)
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # a date that is none: ValueError
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: an invalid date
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
     for part, name in _MOVED:
         if isinstance(plain, dict) and isinstance(plain.get(part), dict):
@@ -328,14 +339,19 @@ def read_config(path: Path) -> RunConfig:
 
 
 def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "config") -> RunConfig:
-    """A configuration with some entries (paths such as ``model.learning_rates.networks``) set to plain values.
+    """Sets some entries of a configuration.
+
+    Args:
+        config: The configuration.
+        entries: Paths such as ``model.learning_rates.networks`` and their plain values.
+        where: Source of the entries, for messages.
 
     Raises:
-        UserError: There is no such entry, or the value is of the wrong type; `where` is named in the message.
+        UserError: There is no such entry, or a value has the wrong type.
     """
     if isinstance(method := entries.get("method"), str):
         try:
-            config = config.with_method(method)  # whose options the other entries are
+            config = config.with_method(method)  # first: the other entries are options of this method
         except UserError as error:
             raise UserError(f"{where}.method: {error}") from error
     plain = to_plain(config)
@@ -351,20 +367,20 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 
 
 def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Paths of the entries in which two configurations differ, each with both plain values; without `scene`."""
+    """Entries, other than `scene`, in which two configurations differ: path -> both plain values."""
     one, other = _flat(to_plain(first)), _flat(to_plain(second))
     paths = dict.fromkeys(path for path in (*one, *other) if path != "scene")
     return {p: (one.get(p), other.get(p)) for p in paths if one.get(p) != other.get(p)}
 
 
 def edited_entries(config: RunConfig, plain: Any) -> str:
-    """Entries in which a configuration is not as a checkpoint's header has it, for a message; empty if none.
+    """Describes in what a configuration differs from that in a checkpoint's header; empty if in nothing.
 
-    The place of the scene and the bound on Gaussians may differ, and so may entries of other versions.
+    The scene folder, the upper bound on Gaussians and entries that only one of them has are ignored.
 
     Args:
-        config: As `config.yaml` has it now.
-        plain: As `to_plain` gave it when the checkpoint was written.
+        config: The current configuration, from `config.yaml`.
+        plain: The plain configuration in the checkpoint's header.
     """
     now, then = _flat(to_plain(config)), _flat(plain)
     allowed = {"scene", "train.density.max_gaussians"}

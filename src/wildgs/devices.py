@@ -1,4 +1,4 @@
-"""Carrying tensors to a GPU."""
+"""Copying tensors to a GPU."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor in main memory, on a device.
+    """Copies a CPU tensor to a device, from pinned memory if that is a GPU.
 
-    To a GPU it is copied from pinned memory: a copy from pageable memory waits for all work queued before.
+    A copy from pageable memory would wait for all work queued on the GPU.
     """
     if device.type == "cuda":
         return tensor.pin_memory().to(device, non_blocking=True)

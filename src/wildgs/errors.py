@@ -1,8 +1,8 @@
-"""What goes wrong by a user's mistake, as opposed to a fault of this program."""
+"""Exceptions and warnings of the package."""
 
 
 class UserError(Exception):
-    """A mistake that the user can mend.
+    """An error that the user can correct, such as a missing file or an invalid option.
 
     The message is one line: what is wrong (with the file's name) and what to do. The command line prints it
     without a traceback and exits with code 2.
@@ -10,8 +10,8 @@ class UserError(Exception):
 
 
 class WildGSWarning(UserWarning):
-    """Something was left out and work continues; the message says what is lost and how to get it."""
+    """Work continues without something; the message says what is missing and how to get it."""
 
 
 class ReportedError(UserError):
-    """A mistake that another process of the same training tells the user about: this one ends in silence."""
+    """An error that another process of a distributed training reports; this process exits without a message."""

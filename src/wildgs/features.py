@@ -1,6 +1,6 @@
-"""Ways of computing on CUDA that can be switched off one by one, to compare them or to work around a fault.
+"""Optimisations for CUDA that can be switched off one by one, for comparisons or to work around a bug.
 
-`WILDGS_WITHOUT=triton_ssim,triton_planes` in the environment switches some of them off.
+The environment variable `WILDGS_WITHOUT=triton_ssim,triton_planes` switches some of them off.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from collections.abc import Callable
 from wildgs.errors import WildGSWarning
 
 FEATURES = {
-    "triton_ssim": "SSIM and its gradient in four Triton kernels; else by convolutions",
-    "triton_planes": "the triplane sampled channels-last by Triton kernels; else by grid_sample",
-    "spread_rejected": "pixels that are not lifted spread over many cells in the scatter; else all in one",
-    "split_weights": "weight gradients of the fusion network summed in parts; else one product over all Gaussians",
-    "written_gradients": "gradients of replayed graphs written by one autograd function; else one accumulator each",
-    "skip_on_device": "fused Adam skips a step that is not finite by itself; else the host waits to judge it",
-    "densify_once": "densification moves every tensor once, in its final order; else a second time to sort it",
-    "checkpoint_thread": "checkpoints written by a thread; else by the training loop",
+    "triton_ssim": "SSIM and its gradient by four Triton kernels instead of convolutions",
+    "triton_planes": "channels-last triplane sampling by Triton kernels instead of grid_sample",
+    "spread_rejected": "spreads pixels that are not lifted over many cells of the scatter instead of one",
+    "split_weights": "sums weight gradients of the fusion network in parts instead of one product over all Gaussians",
+    "written_gradients": "writes gradients of replayed graphs by one autograd function instead of one accumulator each",
+    "skip_on_device": "skips non-finite steps on the device by fused Adam instead of waiting for the host",
+    "densify_once": "moves every tensor once in densification, in its final order, instead of sorting it afterwards",
+    "checkpoint_thread": "writes checkpoints in a thread instead of the training loop",
 }
 
 
@@ -28,21 +28,21 @@ def is_on(name: str) -> bool:
     """Whether a feature is on.
 
     Raises:
-        ValueError: There is no feature of that name.
+        ValueError: The name is unknown.
     """
     if name not in FEATURES:
-        raise ValueError(f"there is no feature {name!r}; they are {', '.join(FEATURES)}")
+        raise ValueError(f"unknown feature {name!r}; choose from {', '.join(FEATURES)}")
     return name not in os.environ.get("WILDGS_WITHOUT", "").replace(" ", "").split(",")
 
 
 def has_triton(name: str, probe: Callable[[], object]) -> bool:
-    """Whether a feature is on that needs Triton (in torch's CUDA builds for Linux), and its kernels run here.
+    """Whether a feature that needs Triton is on and its kernels run on this machine.
 
-    They need an Ampere or newer GPU, and Triton needs a C compiler.
+    Requires an Ampere or newer GPU, torch's CUDA build for Linux (which includes Triton) and a C compiler.
 
     Args:
         name: The feature.
-        probe: Runs its kernels on the smallest input; called once in a process.
+        probe: Runs its kernels on a minimal input; called once per process.
     """
     return is_on(name) and _runs(name, probe)
 
@@ -65,11 +65,11 @@ def _runs_triton() -> bool:
 def _succeeds(name: str, probe: Callable[[], object]) -> bool:
     try:
         probe()
-    except Exception as error:  # Triton, its compilers and the driver raise many kinds
+    except Exception as error:  # Triton, its compilers and the driver raise many types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         warnings.warn(
-            f"Triton kernels cannot be used here ({reason}); training continues without, slower "
-            f"(WILDGS_WITHOUT={name} leaves them out)",
+            f"Triton kernels do not work here ({reason}); training continues without them and is slower "
+            f"(WILDGS_WITHOUT={name} switches them off)",
             WildGSWarning,
             stacklevel=4,
         )

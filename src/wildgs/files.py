@@ -15,7 +15,7 @@ from typing import Any
 from wildgs.errors import UserError
 
 MAX_NAME_BYTES = 255
-"""Longest file name that common file systems take."""
+"""Longest file name that common file systems allow."""
 
 _BIDI_CONTROLS = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 
@@ -72,7 +72,7 @@ def _aside(file: Path) -> Path:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes temporary files that killed processes left in a folder which no other process writes to now."""
+    """Removes temporary files of killed processes from a folder that no other process is writing to."""
     for leftover in folder.glob(f".*{ASIDE_SUFFIX}"):
         leftover.unlink(missing_ok=True)
 
@@ -89,7 +89,7 @@ def _flush(path: Path) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a path is a regular file, or a link to one; False as well for names that no file system takes."""
+    """Whether a path is a regular file or a link to one; False for invalid names."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # a name that is too long, a null character
@@ -97,7 +97,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_there(path: Path) -> bool:
-    """Whether a name is taken, be it by a pipe or a link to nothing; False for names that no file system takes."""
+    """Whether a path exists, as a file of any kind or a broken link; False for invalid names."""
     try:
         return path.is_symlink() or path.exists()
     except (OSError, ValueError):
@@ -105,7 +105,7 @@ def is_there(path: Path) -> bool:
 
 
 def fingerprint(path: Path) -> str:
-    """A short digest of a file's size, beginning and end; empty where it cannot be read."""
+    """A short digest of a file's size, beginning and end; empty if the file cannot be read."""
     try:
         check_regular(path)
         with path.open("rb") as file:
@@ -120,10 +120,10 @@ def fingerprint(path: Path) -> str:
 
 
 def check_regular(path: Path) -> None:
-    """Refuses what may never end when it is read: pipes, sockets and devices such as /dev/zero.
+    """Rejects pipes, sockets and devices such as /dev/zero, which could be read endlessly.
 
     Raises:
-        OSError: The path is no regular file, does not exist or cannot be reached.
+        OSError: The path is not a regular file, does not exist or is not accessible.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError("not a regular file")
@@ -133,8 +133,8 @@ def read_json(path: Path) -> Any:
     """The content of a JSON file.
 
     Raises:
-        OSError: It is no regular file, or cannot be read.
-        ValueError: It holds no JSON, or lists in lists beyond measure.
+        OSError: It is not a regular file, or cannot be read.
+        ValueError: It is not JSON, or is nested too deeply.
     """
     check_regular(path)
     try:
@@ -144,10 +144,10 @@ def read_json(path: Path) -> Any:
 
 
 def printable(name: str) -> str:
-    r"""A file's name as text that every screen, page and text file can hold.
+    r"""A file name as printable text.
 
-    Names are bytes on most systems. Bytes that are not UTF-8, control characters, line ends and characters that
-    reverse the direction of writing are shown as escapes such as `\xe9`.
+    Bytes that are not UTF-8, control characters, line ends and bidirectional control characters are replaced by
+    escapes such as `\xe9`.
     """
     return "".join(_escaped(character) if is_unprintable(character) else character for character in name)
 
@@ -159,6 +159,6 @@ def is_unprintable(character: str) -> bool:
 
 def _escaped(character: str) -> str:
     code = ord(character)
-    if 0xDC80 <= code <= 0xDCFF:  # how Python holds a byte that is not UTF-8
+    if 0xDC80 <= code <= 0xDCFF:  # Python's surrogateescape of a byte that is not UTF-8
         return f"\\x{code - 0xDC00:02x}"
     return character.encode("unicode_escape").decode("ascii")

@@ -1,4 +1,4 @@
-"""Whether the Hugging Face hub can be asked at all: its client retries for half a minute where it cannot."""
+"""Checks whether the Hugging Face hub is reachable; its own client retries for half a minute if it is not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TIMEOUT = 4.0
 
 
 def hub_reachable(timeout: float = TIMEOUT) -> bool:
-    """Whether the hub answers within `timeout` seconds; False where HF_HUB_OFFLINE forbids asking."""
+    """Whether the hub answers within `timeout` seconds; False if HF_HUB_OFFLINE is set."""
     from huggingface_hub import constants
 
     if constants.HF_HUB_OFFLINE or os.environ.get("HF_HUB_OFFLINE", "0").lower() in (
@@ -27,11 +27,11 @@ def hub_reachable(timeout: float = TIMEOUT) -> bool:
         try:
             urllib.request.urlopen(urllib.request.Request(constants.ENDPOINT, method="HEAD"), timeout=timeout)
         except urllib.error.HTTPError:
-            answered.set()  # an answer, if not a kind one
+            answered.set()  # an HTTP error is an answer too
         except (OSError, ValueError):
             return
         answered.set()
 
-    # Looking up a name has no timeout of its own, hence the thread.
+    # In a thread, because the DNS lookup has no timeout.
     threading.Thread(target=ask, daemon=True).start()
     return answered.wait(timeout)

@@ -1,7 +1,7 @@
-"""Numba's `njit` with a cache on disk, keyed by the digest of all files that a kernel may be compiled from.
+"""Numba's `njit` with a disk cache whose key is a digest of all source files that a kernel may be compiled from.
 
-Numba's own cache looks at the file of a kernel alone, so that after an edit of another file whose functions the
-kernel calls the old code would run. It also fails where neither the package nor the home folder can be written to.
+Numba's own cache only checks the kernel's own file, so that outdated code would run after a change in another file
+whose functions the kernel calls. It also fails if neither the package nor the home folder is writable.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 from wildgs.errors import WildGSWarning
 
 _SHARED = ("threads.py", "kernel_cache.py")
-"""Files of the package that kernels of all folders use."""
+"""Files of the package that all kernels use."""
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -41,7 +41,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 @cache
 def source_digest(folder: Path) -> str:
-    """SHA-256 over the Python files of a folder of kernels and those that kernels of all folders use."""
+    """SHA-256 of the Python files of a folder of kernels and of `_SHARED`."""
     package = Path(__file__).parent
     digest = hashlib.sha256()
     for file in [*sorted(folder.glob("*.py")), *(package / name for name in _SHARED)]:
@@ -52,10 +52,10 @@ def source_digest(folder: Path) -> str:
 
 @cache
 def cache_folder(folder: Path) -> Path | None:
-    """Where the compiled kernels of a folder are kept; None where no disk can be written to.
+    """The folder for the compiled kernels of a source folder; None if no folder is writable.
 
-    `NUMBA_CACHE_DIR` where it is set, else `__pycache__` beside the kernels, else the user's cache folder. Where
-    none is writable, one warning is given and a temporary folder serves until the process ends.
+    The first writable one of `NUMBA_CACHE_DIR`, `__pycache__` in the source folder, and the user's cache folder. If
+    there is none, warns and uses a temporary folder until the process ends.
     """
     for candidate in _candidates(folder):
         if _is_writable(candidate):
@@ -64,7 +64,7 @@ def cache_folder(folder: Path) -> Path | None:
 
 
 def _candidates(folder: Path) -> Iterator[Path]:
-    # Two installations must not overwrite each other's kernels.
+    # The digest keeps the kernels of several installations apart.
     name = f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()[:16]}"
     chosen = getattr(config, "CACHE_DIR", "")
     if chosen:
@@ -90,8 +90,8 @@ def _is_writable(folder: Path) -> bool:
 @cache
 def _temporary_folder() -> Path | None:
     message = (
-        "neither the package's folder nor the home folder can be written to, so every process compiles the CPU "
-        "kernels again; set NUMBA_CACHE_DIR to a folder that can be written to"
+        "neither the package's folder nor the home folder is writable, so every process compiles the CPU kernels "
+        "again; set NUMBA_CACHE_DIR to a writable folder"
     )
     warnings.warn(message, WildGSWarning, stacklevel=5)
     try:
@@ -103,10 +103,10 @@ def _temporary_folder() -> Path | None:
 
 
 class _Locator(_CacheLocator):
-    """Tells Numba where a kernel's cache is and what it depends on."""
+    """Provides Numba with the location and the key of a kernel's cache."""
 
     def __init__(self, function: Any, file: str) -> None:
-        self._py_file = file  # Numba reads it for warnings
+        self._py_file = file  # read by Numba's warnings
         self._line = function.__code__.co_firstlineno
 
     def get_cache_path(self) -> str:

@@ -1,4 +1,4 @@
-"""Named configurations: the default, the paper as printed, the paper with training as by default, the quick one."""
+"""Presets: named changes of the default configuration."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)
 
 @dataclass(frozen=True)
 class Preset:
-    """What a named configuration changes.
+    """Changes of the default configuration.
 
     Attributes:
-        entries: From an entry's path in `config.yaml` to its plain value.
-        steps: Share of the steps asked for that are taken.
+        entries: Paths of entries in `config.yaml` and their plain values.
+        steps: Factor on the number of training steps.
     """
 
     entries: Mapping[str, Any] = field(default_factory=dict)
@@ -56,17 +56,14 @@ _PAPER: dict[str, Any] = {
     "train.density.prune_reach": 0.0,
     "train.density.reset_unseen": True,
 }
-"""What the default has and the paper does not have, switched off or set to the paper's value."""
+"""Switches off the additions of the default configuration and sets the paper's values."""
 _PRINTED: dict[str, Any] = {
     "model.parsing.bounded_logits": False,
     "model.fusion.direct_path": False,
     "train.objective.mask_gradient": "loss",
     "train.schedule.mask_pause": 0,
 }
-"""Further options of the default that the paper does not have; the preset `paper-mended` keeps them on.
-
-They concern how the mask and the fusion train, not what the model can represent.
-"""
+"""Additions of the default that stabilise training of mask and fusion; the preset `paper-mended` keeps them."""
 
 PRESETS: dict[PresetName, Preset] = {
     "default": Preset(),
@@ -74,14 +71,11 @@ PRESETS: dict[PresetName, Preset] = {
     "paper-mended": Preset(_PAPER),
     "fast": Preset({"model.parsing.max_side": 192}, steps=0.5),
 }
-"""docs/study.md has the measurements; docs/decisions.md says where the paper leaves the value open."""
+"""Measurements: docs/study.md. Values that the paper leaves open: docs/decisions.md."""
 
 
 def with_preset(config: RunConfig, name: PresetName) -> RunConfig:
-    """A configuration with a preset's entries and share of the steps.
-
-    Entries that the configuration's method does not have are left out.
-    """
+    """Applies a preset to a configuration; entries that its method does not have are skipped."""
     preset = PRESETS[name]
     entries = {path: value for path, value in preset.entries.items() if _has(config, path)}
     changed = with_entries(config, entries, f"preset {name}")

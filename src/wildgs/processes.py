@@ -1,4 +1,4 @@
-"""The process: its place among those of torchrun, signals that end it, its environment; imports little."""
+"""The process: its rank under torchrun, signal handlers and environment variables. Imports no heavy package."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from types import FrameType
 from typing import Any
 
 LIBRARY_DEFAULTS = {
-    # oneDNN compiles a convolution or matrix product for every size and keeps the last 1,024. A collection of
-    # photos of many sizes needs more: two thirds of every step went into compiling again.
+    # oneDNN compiles a primitive for every tensor shape and caches 1,024 of them. Photos of many sizes need more:
+    # two thirds of every step were spent on compiling again.
     "ONEDNN_PRIMITIVE_CACHE_CAPACITY": "8192",
-    # By default MKL's order of addition depends on where in memory a matrix lies, and two equal trainings, or one
-    # that was resumed, differ in the last bit.
+    # By default MKL's order of summation depends on memory alignment, so that repeated or resumed trainings would
+    # differ in the last bit.
     "MKL_CBWR": "AUTO,STRICT",
 }
 
 
 @contextmanager
 def library_environment() -> Iterator[None]:
-    """Sets `LIBRARY_DEFAULTS` where the environment has no value of its own, for as long as the block runs.
+    """Sets those environment variables of `LIBRARY_DEFAULTS` that are not set, for the duration of the block.
 
-    oneDNN and MKL read them at their first call in the process and never again.
+    oneDNN and MKL read them once, at their first call in the process.
     """
     added = [name for name in LIBRARY_DEFAULTS if name not in os.environ]
     os.environ.update({name: LIBRARY_DEFAULTS[name] for name in added})
@@ -39,12 +39,12 @@ ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") i
 
 
 class TerminatedError(KeyboardInterrupt):
-    """The process was asked to end.
+    """The process received a signal to terminate.
 
-    An interrupt, so that whatever is temporary is removed on the way out.
+    A `KeyboardInterrupt`, so that temporary files are removed as after Ctrl-C.
 
     Attributes:
-        code: The process's exit code by the shell's convention, 128 + signal.
+        code: Exit code by the shell's convention, 128 + signal number.
     """
 
     def __init__(self, number: int) -> None:
@@ -54,10 +54,10 @@ class TerminatedError(KeyboardInterrupt):
 
 @contextmanager
 def signals_as_interrupts() -> Iterator[None]:
-    """Has SIGTERM and SIGHUP raise `TerminatedError` in the block; the second one ends the process at once.
+    """Makes SIGTERM and SIGHUP raise `TerminatedError` in the block; a second signal kills the process.
 
-    Signals that the process ignores (nohup) stay ignored. Outside the main thread, where Python allows no handlers,
-    nothing changes.
+    Signals that the process ignores (nohup) stay ignored. Does nothing outside the main thread, where Python does not
+    allow signal handlers.
     """
     previous: dict[int, Any] = {}
 
@@ -69,7 +69,7 @@ def signals_as_interrupts() -> Iterator[None]:
     if threading.current_thread() is threading.main_thread():
         for number in ENDING_SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
-                # Also where Python's handler is the same: pycolmap sets one of its own, which prints a C++ stack.
+                # Unconditionally: pycolmap may have installed a C++ handler, which Python does not know of.
                 previous[number] = signal.signal(number, end)
     try:
         yield
@@ -79,20 +79,20 @@ def signals_as_interrupts() -> Iterator[None]:
 
 
 def world_size() -> int:
-    """How many processes were started together; 1 without torchrun."""
+    """Number of processes; 1 without torchrun."""
     return int(os.environ.get("WORLD_SIZE", "1")) if "RANK" in os.environ else 1
 
 
 def rank() -> int:
-    """This process's number among all, from 0."""
+    """Rank of this process among all processes."""
     return int(os.environ["RANK"]) if world_size() > 1 else 0
 
 
 def local_rank() -> int:
-    """This process's number among those on this machine, from 0."""
+    """Rank of this process among those on this machine."""
     return int(os.environ.get("LOCAL_RANK", "0")) if world_size() > 1 else 0
 
 
 def local_world_size() -> int:
-    """How many of the processes run on this machine."""
+    """Number of processes on this machine."""
     return max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))) if world_size() > 1 else 1

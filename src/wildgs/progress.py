@@ -1,4 +1,4 @@
-"""Progress of long work, and work by threads that reports it."""
+"""Progress callbacks, and a thread pool that reports progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Counter = Callable[[int, int], None]
-"""Called with (pieces done, pieces in all)."""
+"""Called with (items done, total number of items)."""
 
 
 @runtime_checkable
@@ -17,7 +17,13 @@ class Progress(Protocol):
     """A callback for the progress of long work."""
 
     def __call__(self, stage: str, done: int, total: int, /) -> None:
-        """Called with what is being done, as in "reading photos", the pieces done, and in all (0 if not known)."""
+        """Reports progress.
+
+        Args:
+            stage: What is being done, such as "reading photos".
+            done: Items done.
+            total: Total number of items; 0 if unknown.
+        """
 
 
 def silent(stage: str, done: int, total: int, /) -> None:
@@ -25,7 +31,7 @@ def silent(stage: str, done: int, total: int, /) -> None:
 
 
 def counter(progress: Progress | None, stage: str) -> Counter:
-    """A callback for the pieces of one stage."""
+    """A callback for the items of one stage."""
     show = progress or silent
     return lambda done, total: show(stage, done, total)
 
@@ -33,7 +39,7 @@ def counter(progress: Progress | None, stage: str) -> Counter:
 def in_threads(
     function: Callable[[Item], Result], items: Sequence[Item], threads: int, progress: Counter | None = None
 ) -> Iterator[Result]:
-    """A function's result for each item, in order, computed by several threads, which stop on an error."""
+    """Yields a function's result for each item, in order, computed by several threads that stop on an error."""
     pool = ThreadPoolExecutor(threads)
     try:
         for done, result in enumerate(pool.map(function, items), start=1):

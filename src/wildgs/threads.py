@@ -1,9 +1,9 @@
-"""Runs a compiled kernel on several threads that draw work from one shared counter.
+"""Runs a compiled kernel on several threads that take work items from one shared counter.
 
-A kernel releases the interpreter's lock and is called once per thread as `kernel(counter, *arguments)`; it takes
-work items with `fetch_add(counter, 1)` until none are left. What an item writes must not depend on who works on
-it, so results are the same for any number of threads. There is no global pool of Numba's in play: launches from
-several Python threads at once (autograd's backward thread, a viewer) are safe.
+A kernel releases the GIL and is called once per thread as `kernel(counter, *arguments)`; it takes work items with
+`fetch_add(counter, 1)` until none are left. The result of an item must not depend on the thread that computes it, so
+that results are the same for any number of threads. Numba's global thread pool is not used, so that several Python
+threads (autograd's backward thread, a viewer) may launch kernels at the same time.
 """
 
 from __future__ import annotations
@@ -29,14 +29,13 @@ from wildgs.errors import UserError
 _ANNOUNCE_AFTER = 1.0
 _announced = threading.Event()
 
-
 _limit: list[int] = []
-"""Numbers of threads that `limited` asks for, the innermost last."""
+"""Thread counts of the active `limited` blocks, the innermost last."""
 
 
 @contextmanager
 def limited(count: int | None) -> Iterator[None]:
-    """Runs kernels and torch on so many threads while the block runs; None changes nothing."""
+    """Sets the number of threads of kernels and torch for the duration of the block; None changes nothing."""
     if count is None:
         yield
         return
@@ -51,7 +50,7 @@ def limited(count: int | None) -> Iterator[None]:
 
 
 def thread_count() -> int:
-    """How many threads kernels run on: those of `limited`, `WILDGS_NUM_THREADS`, or what torch uses.
+    """Number of threads of kernels: that of `limited`, else `WILDGS_NUM_THREADS`, else torch's.
 
     Raises:
         UserError: `WILDGS_NUM_THREADS` is not a positive whole number.
@@ -63,24 +62,24 @@ def thread_count() -> int:
         return torch.get_num_threads()
     if not value.isdecimal() or int(value) == 0:
         raise UserError(
-            f"WILDGS_NUM_THREADS={value!r} is not a positive whole number; set it to a count of threads"
+            f"WILDGS_NUM_THREADS={value!r} is not a positive integer; set it to a number of threads"
         )
     return int(value)
 
 
 @cache
 def _pool(process: int, workers: int) -> ThreadPoolExecutor:
-    """Helpers beside the calling thread; one pool a process, since threads do not survive a fork."""
+    """The pool of worker threads; one per process, since threads do not survive a fork."""
     return ThreadPoolExecutor(workers, thread_name_prefix="wildgs")
 
 
 def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = None) -> None:
-    """Calls the kernel on all threads and waits.
+    """Runs a kernel on all threads and waits for it.
 
     Args:
         kernel: A compiled function `kernel(counter, *arguments)`.
-        arguments: Passed on.
-        items: Number of work items, where known: no more threads than that are started.
+        arguments: The kernel's arguments.
+        items: Number of work items, if known: an upper bound on the number of threads.
     """
     workers = thread_count() if items is None else max(1, min(thread_count(), items))
     counter = np.zeros(1, np.int64)
@@ -94,19 +93,19 @@ def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = Non
     pending = [helpers.submit(kernel, counter, *arguments) for _ in range(workers - 1)]
     kernel(counter, *arguments)
     for job in pending:
-        if not job.cancel():  # one that has not begun by now would find nothing left to do
+        if not job.cancel():  # a job that has not started yet has no work left
             job.result()
 
 
 def run_once(kernel: Callable[..., Any], *arguments: Any) -> Any:
-    """Calls a kernel on the calling thread alone; what is short is not worth sharing out."""
+    """Calls a short kernel on the calling thread only."""
     if getattr(kernel, "signatures", True):
         return kernel(*arguments)
     return announce_compilation(kernel, *arguments)
 
 
 def begin(kernel: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Starts a kernel on one thread, beside what the caller does next; what it returns waits for the result."""
+    """Starts a kernel in the background and returns a function that waits for its result."""
     workers = thread_count()
     if workers == 1 or not getattr(kernel, "signatures", True):
         result = run_once(kernel, *arguments)
@@ -115,12 +114,12 @@ def begin(kernel: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
 
 
 def flat(tensor: Tensor) -> np.ndarray:
-    """A tensor's numbers as kernels take them: one axis, contiguous, no gradient."""
+    """A tensor's values as a contiguous 1D array without gradient, as kernels take them."""
     return tensor.detach().contiguous().numpy().reshape(-1)
 
 
 def announce_compilation(kernel: Callable[..., Any], *arguments: Any) -> Any:
-    """Calls a kernel for the first time in this process, with a line on stderr where compiling takes long."""
+    """Calls a kernel that may have to be compiled, and prints a line to stderr if that takes long."""
     timer = threading.Timer(_ANNOUNCE_AFTER, _announce)
     timer.daemon = True
     timer.start()
@@ -142,7 +141,7 @@ def _announce() -> None:
 
 @intrinsic
 def fetch_add(typingctx: Any, array: Any, amount: Any) -> Any:
-    """Atomically adds to element 0 of an int64 array and returns what was there: hands out work to threads."""
+    """Atomically adds to element 0 of an int64 array and returns the previous value."""
 
     def codegen(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> Any:
         data = context.make_array(sig.args[0])(context, builder, args[0]).data

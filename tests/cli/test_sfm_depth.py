@@ -77,7 +77,7 @@ def test_depth_reports_what_it_wrote(
     monkeypatch.setattr(pipeline, "fill_depth_folder", fill)
     depth.run(depth.Command(tmp_path, model="here", device="cpu"))
     assert asked == {"source": "here", "device": "cpu", "required": True}
-    assert "2 written, 1 there before" in capsys.readouterr().out.replace("\n", " ")
+    assert "2 written, 1 already existed" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_depth_by_stereo_needs_no_network(
@@ -91,7 +91,7 @@ def test_depth_by_stereo_needs_no_network(
     monkeypatch.setattr(pipeline, "fill_metric_folder", fill)
     arguments = ["--by", "stereo", "--holdout", "5", "--stereo.max-side", "200", "--overwrite"]
     wildgs(["depth", str(tmp_path), *arguments])
-    assert "4 written, 0 there before" in capsys.readouterr().out.replace("\n", " ")
+    assert "4 written, 0 already existed" in capsys.readouterr().out.replace("\n", " ")
 
 
 @pytest.mark.filterwarnings("ignore:.*other photos agree with:wildgs.errors.WildGSWarning")

@@ -1,4 +1,4 @@
-"""The command line: one module a verb, imported only when the verb is called."""
+"""The command line. Each verb has its own module, which is imported only when the verb is called."""
 
 from __future__ import annotations
 
@@ -18,38 +18,40 @@ from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.version import __version__
 
 VERBS = {
-    "demo": "the built-in landmark: train, score, write a page to look at",
-    "run": "photos in a folder -> sfm -> train -> eval -> a page to look at",
-    "sfm": "camera poses of a folder of photos, with pycolmap",
-    "train": "a scene with poses -> a trained run",
+    "demo": "train and score on the built-in landmark and write a web page",
+    "run": "do everything for a folder of photos: sfm, train, eval, web page",
+    "sfm": "estimate camera poses for a folder of photos with pycolmap",
+    "train": "train on a scene with camera poses",
     "eval": "score a run on its held-out photos",
-    "render": "pictures and videos of a run in the light of any photo",
-    "gallery": "views x appearances of a run as one picture",
-    "appearance": "the light of a photo, or a mix of several, as a small file",
-    "view": "fly through a run in the browser, under any light",
-    "export": "files for other programs, and one web page that carries the light",
-    "depth": "fill a scene's depth/ with Depth Anything V2",
-    "bench": "methods x ablations x seeds on scenes -> one table",
-    "doctor": "what works on this machine, and how to get what does not",
+    "render": "render images and videos of a run in the light of any photo",
+    "gallery": "render a grid of views and appearances as one image",
+    "appearance": "save the light of a photo, or a mix of several, as a small file",
+    "view": "open a run in the browser, under any light",
+    "export": "write files for other programs, or one relightable web page",
+    "depth": "estimate depth maps by Depth Anything V2 or multi-view stereo",
+    "bench": "compare methods, ablations and seeds on scenes in one table",
+    "doctor": "check what works on this machine and how to install the rest",
 }
 DISTRIBUTED = ("train", "bench")
-"""Verbs that torchrun may start on several processes."""
+"""Verbs that torchrun may start as several processes."""
 HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 USER_ERROR = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-"""As a shell reports `wildgs ... | head`, whose reader had enough."""
+"""128 + SIGPIPE: the reader of a pipe, as in `wildgs ... | head`, was closed."""
 
 logger = logging.getLogger("wildgs")
-logger.addHandler(logging.NullHandler())  # or Python prints what is logged a second time
+logger.addHandler(
+    logging.NullHandler()
+)  # without it Python's last-resort handler prints warnings a second time
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs a verb and exits: 0 done, 2 a user's mistake (one line on stderr), 130 or 143 interrupted."""
+    """Runs a verb. Exit codes: 0 success, 2 user error (one line on stderr), 130 or 143 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    for stream in (sys.stdout, sys.stderr):  # names are bytes, and not all of them are text
+    for stream in (sys.stdout, sys.stderr):  # file names need not be valid UTF-8
         if isinstance(stream, io.TextIOWrapper):
-            with contextlib.suppress(OSError):  # a stream that cannot be set up still shows most names
+            with contextlib.suppress(OSError):
                 stream.reconfigure(errors="backslashreplace")
     try:
         _dispatch(arguments)
@@ -58,15 +60,15 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         _fail(" ".join(str(error).split()))
     except BrokenPipeError:
-        if not _reader_has_left():
+        if not _stdout_is_closed():
             raise
         sys.exit(BROKEN_PIPE)
     except KeyboardInterrupt as interrupt:
         if not processes.rank():
-            _say(str(interrupt) or "interrupted")
+            _print_error(str(interrupt) or "interrupted")
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
     finally:
-        _drop_what_cannot_be_shown()
+        _flush_streams()
 
 
 def _dispatch(arguments: list[str]) -> None:
@@ -78,7 +80,7 @@ def _dispatch(arguments: list[str]) -> None:
         return
     verb, *rest = arguments
     if verb not in VERBS:
-        raise UserError(f"there is no verb {verb!r}; `wildgs --help` lists them")
+        raise UserError(f"unknown verb {verb!r}; `wildgs --help` lists the verbs")
     if processes.world_size() > 1 and verb not in DISTRIBUTED:
         raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
     with processes.library_environment():
@@ -89,7 +91,7 @@ def _run(verb: str, arguments: list[str]) -> None:
     import tyro
 
     module = importlib.import_module(f"wildgs.cli.{verb}")
-    # A preset, or the run to resume, among the arguments sets the defaults of the other options.
+    # A preset or a run to resume among the arguments changes the defaults of the other options.
     kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
     description = inspect.cleandoc(module.Command.__doc__)
     if HELP_ALL in arguments:
@@ -99,8 +101,8 @@ def _run(verb: str, arguments: list[str]) -> None:
     command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=description)
     from wildgs.cli.screen import Lines
 
-    if verb != "doctor":  # which says what is missing
-        # With pycolmap, whose handler of SIGTERM would take the place of ours and print a C++ stack.
+    if verb != "doctor":  # doctor reports missing packages itself
+        # Imports pycolmap now: it installs a SIGTERM handler, which would replace ours if it came later.
         importlib.import_module("wildgs.scene")
     lines, level = Lines(), logger.level
     logger.addHandler(lines)
@@ -118,7 +120,7 @@ def _run(verb: str, arguments: list[str]) -> None:
 
 
 def _help(verb: str, module: ModuleType, kind: type, description: str) -> None:
-    """Prints the options that matter, and where the others are; ends the process."""
+    """Prints the main options and how to list all of them, then exits."""
     import tyro
 
     from wildgs.cli.options import count_options, with_only
@@ -135,52 +137,52 @@ def _help(verb: str, module: ModuleType, kind: type, description: str) -> None:
             )
 
 
-def _reader_has_left() -> bool:
-    """Whether nobody reads what is printed any more; then nothing is printed any more either."""
+def _stdout_is_closed() -> bool:
+    """Whether the reader of stdout has closed it; if so, further output is discarded."""
     try:
-        print(flush=True)  # what failed before is no longer in the buffer
+        print(flush=True)
     except BrokenPipeError:
-        _silence(sys.stdout)
+        _discard_output(sys.stdout)
         return True
     return False
 
 
-def _drop_what_cannot_be_shown() -> None:
-    """Python flushes once more on its way out, and would end a finished work with an error there."""
+def _flush_streams() -> None:
+    """Flushes both streams; if that fails, discards the output so that Python's own flush at exit succeeds."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except (OSError, ValueError):
-            _silence(stream)
+            _discard_output(stream)
 
 
-def _silence(stream: Any) -> None:
+def _discard_output(stream: Any) -> None:
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-    """One line on stderr; other libraries' warnings are not the user's business."""
+    """Prints a `WildGSWarning` as one line on stderr and ignores the warnings of other libraries."""
     if issubclass(category, WildGSWarning):
         line = " ".join(str(message).split())
         logger.warning(line)
-        _say(f"{_speaker()}warning: {line}")
+        _print_error(f"{_rank_prefix()}warning: {line}")
 
 
 def _fail(message: str) -> None:
-    _say(f"{_speaker()}error: {message}")
+    _print_error(f"{_rank_prefix()}error: {message}")
     sys.exit(USER_ERROR)
 
 
-def _say(line: str) -> None:
-    """Prints to stderr, which may be gone."""
+def _print_error(line: str) -> None:
+    """Prints to stderr; no error if stderr is closed."""
     from wildgs.cli.screen import ERR
 
     print(line, file=ERR, flush=True)  # pyright: ignore[reportArgumentType]
 
 
-def _speaker() -> str:
-    """Names the process before its message, where it is one of several and not the first."""
+def _rank_prefix() -> str:
+    """The rank, to be printed before a message of any process but the first."""
     return f"rank {processes.rank()}: " if processes.rank() else ""
 
 

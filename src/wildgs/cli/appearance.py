@@ -1,4 +1,4 @@
-"""`wildgs appearance`: the light of a photo, or a mix of several, as a small file."""
+"""`wildgs appearance`: saves the light of a photo, or a mix of several, as a small file."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from wildgs.library.config import MixOptions
 
 @dataclass(frozen=True)
 class Command:
-    """Saves an appearance, to be used wherever --appearance is: render, export, view.
+    """Saves an appearance, which --appearance of render, gallery, export and view accepts.
+
+    The safetensors file contains no code. It is valid for this run at its current step.
 
     Example: wildgs appearance runs/gate evening.jpg --output evening.safetensors
-
-    The file belongs to the run at its present step, and holds no code (safetensors).
     """
 
     run: tyro.conf.Positional[Path]
     """Run folder."""
     photo: tyro.conf.Positional[tuple[str, ...]]
-    """Photo of the scene by name, file of a new photo or any picture, or neutral; several with --weights."""
+    """Name of a photo of the scene, file of a new photo or any image, or neutral; several with --weights."""
     output: Path
-    """File to write, ending in .safetensors."""
+    """File to write (.safetensors)."""
     mix: Mix = field(default_factory=MixOptions)
 
 
 def run(command: Command) -> None:
-    """Finds the look and saves it."""
+    """Embeds the photos and saves the appearance."""
     import wildgs
 
     with progress_shown() as screen:

@@ -1,4 +1,4 @@
-"""`wildgs bench`: methods x ablations x seeds on any scenes, one table."""
+"""`wildgs bench`: compares methods, ablations and seeds on scenes in one table."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from wildgs.evaluation.benchmark import Row
 
 RANK_0_REPORTS = 10.0
-"""Seconds that other ranks wait before they end with a mistake that rank 0 reports."""
+"""Seconds that other ranks wait before they exit with an error that rank 0 reports."""
 WIDTH_IN_FILES = 240
-"""Characters that the printed table may take where no terminal has to show it."""
+"""Width of the printed table in characters when stdout is not a terminal."""
 SHOWN = (
     "output",
     "suite",
@@ -42,33 +42,32 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Command:
-    """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
+    """Trains and scores methods on scenes with several seeds and both protocols, and writes one table.
 
-    The same command continues where it stopped and skips what is done; with more scenes, methods, variants or
-    seeds it does what is new. The table (table.md, table.csv, table.json) is rewritten after every run.
-    Several processes with one --output share the work, started by torchrun or by this command several times: each
-    takes the next run that no other one trains.
+    Finished runs are skipped, so the same command continues after an interruption, and scenes, methods, variants or
+    seeds can be added later. The table (table.md, table.csv, table.json) is updated after every run. Several processes
+    with the same --output, started by torchrun or by hand, share the runs among them.
 
     Example: wildgs bench scenes/gate --output bench --steps 3000 --downscale 2 --methods 3dgs wildgs
     """
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders; with --suite phototourism, the folder that holds its scenes."""
+    """Scene folders; with --suite phototourism, the folder that contains its scenes."""
     output: Path = Path("wildgs-bench")
     """Folder for the runs and the table."""
     suite: Suite | None = None
-    """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, beside the paper's
-    figures. Wild-GS and its ablations are then trained with the preset paper; `default` is a line of its own."""
+    """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, with the paper's figures for
+    comparison. Wild-GS and its ablations then use the preset paper; `default` is a separate row."""
     methods: tuple[str, ...] | None = None
-    """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART); by
-    default all."""
+    """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART). Default:
+    all."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME:KEY=VALUE[,KEY=VALUE...], a further line of the table: Wild-GS with entries of config.yaml changed,
-    as in slow:model.learning_rates.networks=5e-4. May be repeated."""
+    """NAME:KEY=VALUE[,KEY=VALUE...]: an additional row with Wild-GS and some entries of config.yaml changed, for
+    example slow:model.learning_rates.networks=5e-4."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """One run each."""
+    """Random seeds; each is a separate run."""
     lpips: Path | None = None
-    """Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet."""
+    """Folder with other LPIPS weights, for example AlexNet's, than the package's SqueezeNet."""
     data: Annotated[DataConfig, UNNAMED] = field(default_factory=DataConfig)
     model: Annotated[WildGSConfig, UNNAMED] = field(default_factory=WildGSConfig)
     train: Annotated[TrainConfig, UNNAMED] = field(default_factory=TrainConfig)
@@ -76,17 +75,17 @@ class Command:
 
 
 def run(command: Command) -> None:
-    """Does what is not done yet; a run that fails is named, and the others continue.
+    """Does the runs that are not done yet; when one fails, the others continue.
 
     Raises:
-        UserError: The command makes no sense, or some runs failed.
+        UserError: The options are invalid, or some runs failed.
     """
     if not processes.rank():
         return _run(command)
     try:
         _run(command)
     except UserError as error:
-        time.sleep(RANK_0_REPORTS)  # torchrun ends all processes with the first that fails
+        time.sleep(RANK_0_REPORTS)  # torchrun stops all processes when the first one fails
         raise ReportedError(str(error)) from error
 
 
@@ -94,15 +93,15 @@ def _run(command: Command) -> None:
     import wildgs
 
     if command.train.seed != TrainConfig().seed:
-        raise UserError("--seed: a bench takes its seeds from --seeds")
+        raise UserError("--seed: use --seeds in a benchmark")
     first = not processes.rank()
     console.quiet = not first
-    speaker = f"rank {processes.rank()}: " if processes.world_size() > 1 else ""
+    prefix = f"rank {processes.rank()}: " if processes.world_size() > 1 else ""
     with progress_shown() as screen:
 
         def announce(line: str) -> None:
             screen.close()
-            print(f"{speaker}{line}", file=OUT, flush=True)  # pyright: ignore[reportArgumentType]
+            print(f"{prefix}{line}", file=OUT, flush=True)  # pyright: ignore[reportArgumentType]
 
         done = wildgs.benchmark(
             command.scenes,
@@ -120,12 +119,12 @@ def _run(command: Command) -> None:
         )
     if first:
         _print_table(done.rows)
-    console.print(f"{command.output / 'table.md'}, table.csv and table.json hold the table")
+    console.print(f"table written to {command.output / 'table.md'}, table.csv and table.json")
     if done.failures:
         title, reason = next(iter(done.failures.items()))
         raise UserError(
-            f"{len(done.failures)} of {done.runs} runs failed, the first of them {title} ({reason}); the same "
-            "command tries them again"
+            f"{len(done.failures)} of {done.runs} runs failed, first {title} ({reason}); run the same command again "
+            "to retry them"
         )
 
 

@@ -1,4 +1,4 @@
-"""`wildgs demo`: the built-in landmark, from its photos to a page to look at."""
+"""`wildgs demo`: trains on the built-in landmark and writes web pages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from wildgs.cli.screen import print_finished, progress_shown
 
 @dataclass(frozen=True)
 class Command:
-    """Trains Wild-GS and plain 3DGS on the 40 photos of the built-in landmark, scores both and writes a page.
+    """Trains Wild-GS and plain 3DGS on 40 photos of the built-in landmark, scores both and writes two web pages.
 
     Example: wildgs demo --output wildgs-demo
     """
@@ -22,7 +22,7 @@ class Command:
 
 
 def run(command: Command) -> None:
-    """Trains, scores, writes the pages."""
+    """Trains, scores and writes the pages."""
     import wildgs
 
     with progress_shown() as screen:

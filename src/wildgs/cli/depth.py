@@ -1,4 +1,4 @@
-"""`wildgs depth`: the depth of a scene's photos, by a network or by multi-view stereo."""
+"""`wildgs depth`: estimates depth maps of a scene's photos by a network or by multi-view stereo."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from wildgs.scene.config import DataConfig
 
 @dataclass(frozen=True)
 class Command:
-    """Estimates the depth of the photos of a scene and writes it to SCENE/depth/, where training finds it.
+    """Estimates depth maps for the photos of a scene and writes them to SCENE/depth/, where training reads them.
 
-    Depth Anything V2 (network) gives the disparity of every photo, of unknown scale, as 16-bit pictures. Multi-view
-    stereo needs no network: it compares training photos with each other and gives metric depth (.tiff, 32-bit
-    floats in units of the COLMAP model) where three of them agree. Training uses both where both exist. Photos that
-    already have an estimate are skipped.
+    `--by network` uses Depth Anything V2 and writes each photo's disparity, of unknown scale, as a 16-bit PNG.
+    `--by stereo` matches training photos with each other and writes metric depth (.tiff, 32-bit floats in units of
+    the COLMAP model) where at least three photos agree. Training can use both. Photos that already have a depth map
+    are skipped.
 
     Example: wildgs depth scenes/gate --by stereo
     """
@@ -28,21 +28,21 @@ class Command:
     scene: tyro.conf.Positional[Path]
     """Folder of a COLMAP scene (images/ and sparse/0/)."""
     by: Literal["network", "stereo"] = "network"
-    """What estimates depth."""
+    """Depth estimator: Depth Anything V2, or multi-view stereo."""
     model: str = DEPTH_ANYTHING
-    """Folder of the network in the hub's layout, or its name on the hub."""
+    """Name of the network on the Hugging Face hub, or its folder in the hub's layout."""
     overwrite: bool = False
-    """Estimate again what is already there."""
+    """Replace existing depth maps."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where the network runs."""
+    """Device of the network."""
     holdout: int = DataConfig.holdout
-    """Stereo leaves out every n-th photo where the scene has no .tsv split; as --data.holdout of `wildgs train`."""
+    """For stereo: skip every n-th photo if the scene has no .tsv split, as --holdout of `wildgs train`."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
     """Options of stereo."""
 
 
 def run(command: Command) -> None:
-    """Fills the scene's depth folder."""
+    """Writes the depth maps."""
     import wildgs
 
     with progress_shown() as screen:
@@ -56,4 +56,4 @@ def run(command: Command) -> None:
             device=None if command.device == "auto" else command.device,
             progress=screen,
         )
-    console.print(f"{done.folder}: {done.written} written, {done.kept} there before")
+    console.print(f"{done.folder}: {done.written} written, {done.kept} already existed")

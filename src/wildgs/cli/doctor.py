@@ -1,4 +1,4 @@
-"""`wildgs doctor`: what works on this machine."""
+"""`wildgs doctor`: checks what works on this machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Command:
-    """Reports what works on this machine and how to get what does not. Downloads nothing.
+    """Reports what works on this machine and how to install what does not. Downloads nothing.
 
     Example: wildgs doctor --report --run runs/gate
     """
@@ -21,18 +21,18 @@ class Command:
     json: bool = False
     """Print JSON instead of a table."""
     report: bool = False
-    """Print what a bug report needs, without the names of user, machine and home folder."""
+    """Print a text for bug reports, without the names of user, machine and home folder."""
     run: Path | None = None
-    """Run folder whose configuration and last log lines go into the report."""
+    """Run folder whose configuration and last log lines are added to the report."""
     build_gsplat: bool = False
-    """Build gsplat's CUDA extension now (2 to 15 minutes), so that the first training does not have to."""
+    """Build gsplat's CUDA extension now (2 to 15 minutes) instead of at the first training."""
 
 
 def run(command: Command) -> None:
     """Prints the report.
 
     Raises:
-        UserError: With --build-gsplat: the extension cannot be built.
+        UserError: The extension cannot be built (with --build-gsplat).
     """
     from wildgs.library.doctor import build_gsplat, examine, write_report
 
@@ -60,7 +60,7 @@ def _print_table(checks: list[Check]) -> None:
     console.print(table)
     remedies = [check for check in checks if check.remedy is not None]
     if remedies:
-        console.print("\nTo get what is missing:")
+        console.print("\nTo install what is missing:")
     for check in remedies:
         console.print(f"  # {check.name}", style="dim")
-        console.print(f"  {check.remedy}", soft_wrap=True)  # on one line, to be copied
+        console.print(f"  {check.remedy}", soft_wrap=True)  # on one line, so that it can be copied

@@ -1,4 +1,4 @@
-"""`wildgs eval`: scores of a run on the photos that were held out."""
+"""`wildgs eval`: scores a run on its held-out photos."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from wildgs.cli.screen import print_scores, progress_shown
 
 @dataclass(frozen=True)
 class Command:
-    """Scores a run's held-out views and writes them to RUN/eval/.
+    """Scores a run on its held-out photos and writes the scores to RUN/eval/.
 
-    `full` takes a view's light from the whole photo and scores the whole frame; `half` takes it from the left
-    half and scores the right one.
+    The protocol `full` embeds the whole photo and scores the whole image; `half` embeds the left half of the photo
+    and scores the right half.
 
     Example: wildgs eval runs/gate --protocol half
     """
@@ -24,11 +24,11 @@ class Command:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     protocol: Literal["full", "half", "both"] = "both"
-    """Where the light comes from and what is scored."""
+    """Evaluation protocol."""
     scene: Path | None = None
-    """The scene folder, where it is not where it was when the run was trained."""
+    """Scene folder, if it has moved since training."""
     lpips: Path | None = None
-    """Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet."""
+    """Folder with other LPIPS weights, for example AlexNet's, than the package's SqueezeNet."""
 
 
 def run(command: Command) -> None:

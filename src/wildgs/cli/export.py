@@ -1,4 +1,4 @@
-"""`wildgs export`: files for other programs, and the web page that carries the light."""
+"""`wildgs export`: writes files for other programs, or a relightable web page."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from wildgs.library.config import ExportFormat, MixOptions
 
 @dataclass(frozen=True)
 class Command:
-    """Writes a run as files for other programs.
+    """Exports a run to files for other programs.
 
-    html (a page that opens from disk, without server or network), glb (glTF) and usd (OpenUSD) hold all appearances
-    in one file. The others are written once for each appearance, in the frame and scale of the reconstruction.
+    html (a web page that opens from disk, without server or network), glb (glTF) and usd (OpenUSD) hold all
+    appearances in one file. Other formats get one file per appearance. Coordinates are those of the COLMAP model.
 
     Example: wildgs export runs/gate --format html --appearance evening.jpg noon.jpg night.jpg
     """
@@ -27,24 +27,24 @@ class Command:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     format: tuple[ExportFormat, ...] = ("html",)
-    """One or several of html, glb, usd, ply, compressed.ply, splat, spz, sog."""
+    """One or more file formats."""
     appearance: tuple[str, ...] = ()
-    """Photos of the scene by name, files of new photos or any pictures, saved appearances, or neutral. By default
-    html, glb and usd take photos as different as the scene has them, and other files are neutral."""
+    """Names of photos of the scene, files of new photos or any images, saved appearances, or neutral. Default: several
+    photos of very different light for html, glb and usd; neutral for the others."""
     mix: Mix = field(default_factory=MixOptions)
     output: Path | None = None
-    """Folder for the files; by default RUN/export. With one file to write, it may be the file itself."""
+    """Folder for the files, or the file itself if only one is written. Default: RUN/export."""
     title: str | None = None
-    """The page's headline; by default the run folder's name."""
+    """Title of the web page. Default: the run folder's name."""
     aligned: bool = False
-    """Keep the frame of training (+z up, the photos' median depth is 1) instead of the input's."""
+    """Use the frame of training (+z up, median depth of the photos = 1) instead of the COLMAP model's."""
     spz_version: Literal[3, 4] = 4
-    """Of spz: 4, or 3 for programs that do not know 4 yet."""
+    """Version of the spz format; choose 3 for programs that do not support 4 yet."""
     cleanup: Annotated[CleanupConfig, UNNAMED] = field(default_factory=CleanupConfig)
 
 
 def run(command: Command) -> None:
-    """Writes every file, and says what is in it."""
+    """Writes the files and prints their size and content."""
     import wildgs
 
     with progress_shown() as screen:

@@ -1,4 +1,4 @@
-"""`wildgs gallery`: views times appearances of a run as one picture."""
+"""`wildgs gallery`: renders a grid of views and appearances as one image."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from wildgs.cli.screen import console, print_notes, progress_shown
 
 @dataclass(frozen=True)
 class Command:
-    """Renders a grid of views (rows) and appearances (columns) as one picture, and each tile.
+    """Renders a grid of views (rows) and appearances (columns) as one image.
+
+    The first row shows the photos of the appearances, the first column the photos of the views.
 
     Example: wildgs gallery runs/gate --appearance noon.jpg evening.jpg neutral --output gallery
-
-    The first row shows the photos that lend their light, the first column those whose viewpoint is taken.
     """
 
     run: tyro.conf.Positional[Path]
     """Run folder."""
     output: Path | None = None
-    """A picture (.jpg, .png), or a folder: OUTPUT/gallery.jpg and OUTPUT/<appearance>/<view>.png. By default the
-    folder RUN/gallery."""
+    """An image file (.jpg, .png), or a folder for gallery.jpg and <appearance>/<view>.png. Default: RUN/gallery."""
     view: tuple[str, ...] = ()
-    """Photos whose viewpoint is rendered, by name. By default a few that were held out."""
+    """Names of the photos whose viewpoints are rendered. Default: a few held-out photos."""
     light: Annotated[LightOptions, UNNAMED] = field(default_factory=lambda: LightOptions(appearance=()))
 
 
 def run(command: Command) -> None:
-    """Renders all tiles and the sheet."""
+    """Renders the grid."""
     import wildgs
 
     with progress_shown() as screen:

@@ -1,4 +1,4 @@
-"""Options that several verbs share, and how help shows them."""
+"""Options shared by several verbs, and the short help."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from wildgs.library.config import MixOptions
 
 NEUTRAL = "neutral"
 UNNAMED = tyro.conf.arg(name="")
-"""For a field whose options carry no prefix."""
+"""Annotation of a nested dataclass whose options have no prefix."""
 
 Mix = Annotated[MixOptions, UNNAMED]
 
 
 @dataclass(frozen=True)
 class LightOptions(MixOptions):
-    """Where the light comes from."""
+    """Selection of appearances."""
 
     appearance: tuple[str, ...] = (NEUTRAL,)
-    """Photos of the scene by name, new photos, any pictures, saved appearances, or neutral."""
+    """Names of photos of the scene, files of new photos or any images, saved appearances, or neutral."""
 
     @property
     def mixing(self) -> MixOptions:
-        """How the appearances are found and mixed."""
+        """The options without the appearances."""
         return MixOptions(self.weights, self.global_, self.local, self.like, self.sky)
 
 
@@ -45,11 +45,11 @@ def count_options(kind: type) -> int:
 
 
 def with_only(kind: type, shown: Collection[str], prefix: str = "") -> type:
-    """A command whose help shows some of its options; the others cannot be given to it.
+    """A copy of a command's dataclass that has only some of its options, for the short help.
 
     Args:
         kind: The command's dataclass.
-        shown: Paths of the fields to show, as in ``train.steps``; required fields are always shown.
+        shown: Paths of the fields to show, such as ``train.steps``; required fields are always shown.
         prefix: Path of `kind` within the command.
     """
     hints = get_type_hints(kind, include_extras=True)

@@ -1,4 +1,4 @@
-"""`wildgs render`: views of a run, or a video through it, in any light."""
+"""`wildgs render`: renders images or a video of a run in any light."""
 
 from __future__ import annotations
 
@@ -16,39 +16,40 @@ from wildgs.library.config import TrajectoryOptions
 
 @dataclass(frozen=True)
 class Command:
-    """Renders photos' viewpoints, or a video, in the light of any photos.
+    """Renders the viewpoints of photos, or a video along a camera path, in the light of any photos.
+
+    Without --path, and with a folder as --output, one PNG is written for every view and appearance.
 
     Example: wildgs render runs/gate --appearance noon.jpg --to evening.jpg --path orbit --output orbit.mp4
-
-    Without --path, and with a folder as --output, one PNG for every view and appearance.
     """
 
     run: tyro.conf.Positional[Path]
     """Run folder."""
     output: Path
-    """A video (.mp4, .mkv, .mov), a picture (.png, .jpg) of one view in one light, or a folder: of frames with
-    --path, else of OUTPUT/<appearance>/<view>.png."""
+    """A video (.mp4, .mkv, .mov), an image (.png, .jpg) of one view in one light, or a folder: for the frames of
+    --path, else for <appearance>/<view>.png."""
     light: Annotated[LightOptions, UNNAMED] = field(default_factory=LightOptions)
     to: tuple[str, ...] = ()
-    """Appearances to which the light changes during the video, one after the other."""
+    """Appearances to which the light changes during the video, in this order."""
     over: Literal["day"] | None = None
-    """day: the light of the photos from night over morning and noon to evening, instead of --appearance and --to.
-    Photos are ordered by their EXIF time if most of them fit it, and by their light otherwise."""
+    """day: the course of a day, from night through morning and noon to evening, instead of --appearance and --to.
+    Photos are ordered by EXIF time if it fits most of them, else by their light."""
     photos: Path | None = None
-    """Folder of the original photos, whose EXIF blocks tell the hour; by default the scene's images. For --over."""
+    """For --over: folder of the original photos, whose EXIF data holds the time. Default: the scene's images."""
     view: tuple[str, ...] = ()
-    """Photos whose viewpoint is rendered, by name. By default all that were held out, or all where none was."""
+    """Names of the photos whose viewpoints are rendered. Default: all held-out photos, or all photos if there are
+    none."""
     trajectory: Annotated[TrajectoryOptions, UNNAMED] = field(default_factory=TrajectoryOptions)
 
 
 def run(command: Command) -> None:
-    """Renders stills or a video."""
+    """Renders images or a video."""
     import wildgs
 
     light = command.light
     if command.over and (command.to or light != LightOptions()):
         raise UserError(
-            "--over takes its light from all photos; leave --appearance, --to and mixing options out"
+            "--over uses the light of all photos; leave out --appearance, --to and the mixing options"
         )
     with progress_shown() as screen:
         done = wildgs.render(
@@ -65,12 +66,12 @@ def run(command: Command) -> None:
         )
     print_notes(done.looks)
     if done.day is not None:
-        order = "time" if done.day.by_time else "light (their times are unknown, or do not fit it)"
+        order = "EXIF time" if done.day.by_time else "light (EXIF times are missing or contradict it)"
         console.print(f"{len(done.day.phases)} photos ordered by {order}; shown: {', '.join(done.day.keys)}")
         for name, reason in done.day.left_out.items():
             console.print(f"{name} is left out: {reason}")
     if done.fps is None:
-        console.print(f"{done.pictures} pictures -> {done.output}")
+        console.print(f"{done.pictures} images -> {done.output}")
     else:
         width, height = done.size
         console.print(

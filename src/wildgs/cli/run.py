@@ -1,4 +1,4 @@
-"""`wildgs run`: a folder of photos becomes a scored scene, in one command."""
+"""`wildgs run`: from a folder of photos to a scored scene in one command."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ SHOWN = ("steps", "max_side", "downscale", "max_gaussians", "holdout", "image_ca
 
 @dataclass(frozen=True)
 class Command:
-    """Poses, trains, scores and shows a folder of photos.
+    """Estimates camera poses for a folder of photos, trains, scores and writes web pages.
 
-    Steps and size follow the machine unless given: 30,000 steps on photos of up to 1,600 pixels on a GPU, 3,000
-    steps on photos of up to 400 pixels on a CPU. The same command continues where it was interrupted.
+    Default number of steps and image size: 30,000 steps on photos of up to 1,600 pixels on a GPU, 3,000 steps on
+    photos of up to 400 pixels on a CPU. After an interruption, run the same command again to continue.
 
     Example: wildgs run photos/sacre_coeur --output runs/sacre_coeur
     """
@@ -28,24 +28,25 @@ class Command:
     photos: tyro.conf.Positional[Path]
     """Folder of photos."""
     output: Path
-    """Run folder; the posed scene goes to OUTPUT/scene."""
+    """Run folder; the scene with camera poses is written to OUTPUT/scene."""
     steps: int | None = None
     """Training steps."""
     max_side: int | None = None
-    """Reduces each photo so that its own longer side is at most this many pixels; smaller ones stay as they are."""
+    """Longest side of a photo in pixels; larger photos are reduced to it, smaller ones are not changed."""
     downscale: float | None = None
-    """Divides the photos' width and height, before --max-side; without --max-side the only reduction."""
+    """Factor by which the photos' width and height are divided, before --max-side. If it is given without --max-side,
+    photos are not reduced further."""
     max_gaussians: int | None = None
-    """Upper bound on the number of Gaussians; by default it follows the machine."""
+    """Upper bound on the number of Gaussians. Default: depends on the machine's memory."""
     holdout: int | None = None
-    """Every n-th photo is held out for scoring; 0 = none. (default: 8)"""
+    """Hold out every n-th photo for scoring; 0 = none. (default: 8)"""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
     image_cache: str = IMAGE_CACHE
-    """Memory for decoded photos; photos beyond it are decoded again when their turn comes."""
+    """Memory for decoded photos; photos that do not fit are decoded again at every use."""
 
 
 def run(command: Command) -> None:
-    """Runs every stage; a stage that is done already is not done again."""
+    """Runs every stage that is not finished yet."""
     import wildgs
 
     threads = command.sfm.threads if command.sfm.threads > 0 else None

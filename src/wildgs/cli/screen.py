@@ -1,4 +1,4 @@
-"""What the command line prints: progress bars, lines, tables, and all of it lost rather than the work."""
+"""Console output: progress bars, log lines and tables. Output errors never stop the work."""
 
 from __future__ import annotations
 
@@ -41,78 +41,73 @@ _PARTS = (
 """Columns of the printed tables: header, key of the means in `metrics.json`, digits."""
 
 
-class Forgiving:
-    """Standard output or error, from which nobody may be reading: what cannot be shown is dropped.
+class SafeStream:
+    """Wraps stdout or stderr and drops output that cannot be written.
 
-    A full disk under a redirection, a pipe without a reader and a closed terminal must not end a training.
+    A full disk behind a redirection, a closed pipe and a closed terminal must not stop training.
     """
 
     def __init__(self, name: str) -> None:
-        """Sets up a `Forgiving`.
+        """Wraps a stream.
 
         Args:
-            name: `stdout` or `stderr`; looked up at every write, since tests and notebooks exchange them.
+            name: `stdout` or `stderr`, looked up at every write because tests and notebooks replace the streams.
         """
         self._name = name
 
     @property
     def _stream(self) -> Any:
         stream = getattr(sys, self._name)
-        # While a bar is shown, rich stands in for both streams, and writes to the console, which writes here.
+        # While a progress bar is shown, rich replaces both streams by proxies that write to the console, hence here.
         return getattr(stream, "rich_proxied_file", stream) if self._name == "stdout" else stream
 
     def write(self, text: str) -> int:
-        """Writes, if it can."""
+        """Writes text if possible."""
         try:
             try:
                 return self._stream.write(text)
-            except UnicodeEncodeError:  # names of files may be anything
+            except UnicodeEncodeError:  # file names need not be valid UTF-8
                 return self._stream.write(text.encode("ascii", "backslashreplace").decode("ascii"))
-        except (
-            OSError,
-            ValueError,
-            RuntimeError,
-            AttributeError,
-        ):  # closed, full, reentered, or no stream at all
+        except (OSError, ValueError, RuntimeError, AttributeError):  # full disk, closed, reentered, no stream
             return len(text)
 
     def flush(self) -> None:
-        """Flushes, if it can."""
+        """Flushes the stream if possible."""
         try:
             self._stream.flush()
         except (OSError, ValueError, RuntimeError, AttributeError):
             return
 
     def isatty(self) -> bool:
-        """Whether a person looks at it."""
+        """Whether the stream is a terminal."""
         try:
             return self._stream.isatty()
         except (OSError, ValueError, AttributeError):
             return False
 
     def __getattr__(self, name: str) -> Any:
-        if name == "rich_proxied_file":  # or rich would write past this class
+        if name == "rich_proxied_file":  # otherwise rich would bypass this class
             raise AttributeError(name)
         return getattr(self._stream, name)
 
 
-OUT, ERR = Forgiving("stdout"), Forgiving("stderr")
+OUT, ERR = SafeStream("stdout"), SafeStream("stderr")
 
-# Names of files and photos are the user's text, which may look like rich's markup.
+# No markup: names of files and photos may contain square brackets.
 console = Console(file=OUT, highlight=False, soft_wrap=True, markup=False, emoji=False)  # pyright: ignore[reportArgumentType]
 
 
 class Lines(logging.Handler):
-    """Prints what the library logs: one line each."""
+    """Prints the library's log messages, one per line."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Prints a record of level INFO; warnings are printed where they are raised."""
+        """Prints a record of level INFO; `warnings.showwarning` prints warnings."""
         if record.levelno == logging.INFO and not processes.rank():
             console.print(record.getMessage())
 
 
 class Screen:
-    """Shows progress: a `Progress`, and an observer of training by its method `step`."""
+    """Shows progress. It is a `Progress` callback; its method `step` is an observer of training."""
 
     def __init__(self) -> None:
         self._stage = ""
@@ -122,7 +117,7 @@ class Screen:
         self._first, self._started, self._last_line = 0, 0.0, 0.0
 
     def __call__(self, stage: str, done: int, total: int, /) -> None:
-        """Shows that `done` of `total` pieces of a stage are finished; as a line where there is no terminal."""
+        """Shows that `done` of `total` items of a stage are finished, by a bar on a terminal, else by lines."""
         if stage != self._stage:
             self._begin(stage, done, total)
         if self._bar is not None:
@@ -137,7 +132,7 @@ class Screen:
             self.close()
 
     def step(self, report: StepReport) -> None:
-        """Notes what is worth showing of a training step."""
+        """Updates speed, loss and number of Gaussians."""
         if not report.falls_on(REFRESH_STEPS):
             return
         rate = (report.step - self._first) / max(time.monotonic() - self._started, 1e-6)
@@ -145,7 +140,7 @@ class Screen:
         self._detail = f"{rate:.1f} steps/s  loss {loss:.4f}  {report.num_gaussians:,} Gaussians"
 
     def close(self) -> None:
-        """Ends the present bar."""
+        """Closes the current progress bar."""
         if self._bar is not None:
             self._bar.stop()
         self._bar, self._stage, self._detail = None, "", ""
@@ -172,7 +167,7 @@ class Screen:
 
 @contextmanager
 def progress_shown() -> Iterator[Screen]:
-    """A `Screen` for the time of a block."""
+    """Gives a `Screen` and closes it at the end of the block."""
     screen = Screen()
     try:
         yield screen
@@ -181,22 +176,22 @@ def progress_shown() -> Iterator[Screen]:
 
 
 def print_notes(looks: Iterable[Look]) -> None:
-    """Says of appearances how they were found, where that is worth a line."""
+    """Prints the notes of appearances, such as how a new photo was localised."""
     for look in looks:
         if look.note:
             console.print(f"{look.name}: {look.note}")
 
 
 def print_finished(finished: FinishedRun) -> None:
-    """Prints the scores, and where the pages are."""
+    """Prints the scores and the paths of the web pages."""
     if finished.scores:
         print_scores(finished.scores)
     console.print(f"open {finished.report.resolve()} in a browser: scores and comparisons")
-    console.print(f"open {finished.page.resolve()} in a browser: the scene itself, under several lights")
+    console.print(f"open {finished.page.resolve()} in a browser: the 3D scene under several lights")
 
 
 def print_scores(runs: Mapping[str, Scores]) -> None:
-    """Prints scores, what can be measured without truth, and what could not be computed."""
+    """Prints tables of the scores, and notes on scores that could not be computed."""
     table = Table("run", "protocol", *(header for header, _, _ in _SCORES), "Gaussians", "frames/s")
     parts = Table("run", "protocol", *(header for header, _, _ in _PARTS), "static hidden", "worst photo")
     notes: dict[str, None] = {}

@@ -1,4 +1,4 @@
-"""`wildgs sfm`: from a folder of photos to a scene with camera poses."""
+"""`wildgs sfm`: estimates camera poses for a folder of photos."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from wildgs.sfm.config import SfmConfig
 
 @dataclass(frozen=True)
 class Command:
-    """Finds the cameras of a folder of photos (structure from motion) and writes a COLMAP scene.
+    """Estimates the cameras of a folder of photos by structure from motion and writes a COLMAP scene.
 
-    Photos that cannot be registered are named with the likely reason; the others are not affected. After an
-    interruption, the same command continues.
+    Photos that cannot be registered are listed with the likely reason. After an interruption, run the same command
+    again to continue.
 
     Example: wildgs sfm photos/gate --output scenes/gate
     """
 
     photos: tyro.conf.Positional[Path]
-    """Folder of photos, sub-folders included."""
+    """Folder of photos, searched with its sub-folders."""
     output: Path
     """Scene folder to write."""
     overwrite: bool = False
-    """Replace the scene of an earlier run."""
+    """Replace an existing scene."""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
 
 
@@ -40,4 +40,4 @@ def run(command: Command) -> None:
         )
     for line in report.lines():
         console.print(line)
-    console.print(f"scene in {command.output}")
+    console.print(f"scene written to {command.output}")

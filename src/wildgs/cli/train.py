@@ -1,4 +1,4 @@
-"""`wildgs train`: a scene with poses becomes a trained run."""
+"""`wildgs train`: trains on a scene with camera poses."""
 
 from __future__ import annotations
 
@@ -44,38 +44,39 @@ SHOWN = (
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """Trains Wild-GS (or its baseline 3dgs) on a COLMAP scene.
+    """Trains Wild-GS (or a baseline) on a COLMAP scene.
 
     Example: wildgs train brandenburg_gate --output runs/gate --downscale 2
     """
 
     scene: tyro.conf.Positional[Path]
-    """Scene folder: images/ and sparse/0/ (see docs/scene.md); with --resume, where it lies now."""
+    """Scene folder with images/ and sparse/0/ (see docs/scene.md); with --resume, its current location."""
     output: Path
     """Run folder to write."""
     method: MethodName = DEFAULT_METHOD
-    """Method to train; `--method NAME --help-all` lists its options. 3dgs is plain 3D Gaussian Splatting."""
+    """Method to train: wildgs, 3dgs (plain 3D Gaussian Splatting) or affine (per-photo embeddings and affine colours).
+    `--method NAME --help-all` lists a method's options."""
     preset: PresetName = "default"
-    """default: best measured results; paper: nothing that the paper does not have; fast: half the steps and a
-    lighter 2D Parsing. Options on the command line override the preset."""
+    """default: best measured results; paper: the paper's method without additions; paper-mended: the same with stable
+    training of mask and fusion; fast: half the steps and a lighter 2D Parsing. Other options override the preset."""
     resume: bool = False
-    """Resume from the newest checkpoint, with the configuration of the run. Only options of execution and
-    --max-gaussians may change."""
+    """Resume from the newest checkpoint with the run's configuration. Only --max-gaussians and options that do not
+    affect the result may change."""
     max_gaussians: int | None = None
-    """Upper bound on the number of Gaussians. By default --density.max-gaussians, or less where memory is short."""
+    """Upper bound on the number of Gaussians. Default: --density.max-gaussians, or less if memory is short."""
     data: Annotated[DataConfig, UNNAMED] = field(default_factory=DataConfig)
-    model: Annotated[Any, UNNAMED] = None  # `command_for` gives it the type of the method's options
+    model: Annotated[Any, UNNAMED] = None  # `command_for` sets the type to the method's config
     train: Annotated[TrainConfig, UNNAMED] = field(default_factory=TrainConfig)
     execution: Annotated[ExecutionConfig, UNNAMED] = field(default_factory=ExecutionConfig)
     view: bool = False
-    """Show training in the browser and keep the viewer open afterwards. Takes at most 5% of the time."""
+    """Show training in the browser and keep the viewer open afterwards. Takes at most 5% of the training time."""
     server: ServerConfig = field(default_factory=ServerConfig)
 
 
 def command_for(arguments: list[str]) -> type[Command]:
-    """The command with the options of the method among the arguments, or of the stored run.
+    """Builds the command for the method that the arguments select.
 
-    Defaults are the stored run's configuration, or the preset's.
+    Defaults of its options come from the configuration of the run to resume, else from the preset.
     """
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     finder.add_argument("--preset", choices=PRESET_NAMES, default="default")
@@ -85,14 +86,14 @@ def command_for(arguments: list[str]) -> type[Command]:
     try:
         found = finder.parse_known_args(arguments)[0]
     except argparse.ArgumentError:
-        found = finder.parse_args([])  # tyro reports what is wrong
+        found = finder.parse_args([])  # tyro reports the error
     config, fields = RunConfig(method=found.method), []
     method = Literal[tuple(METHODS)]  # pyright: ignore[reportInvalidTypeForm]
     if found.resume and found.output is not None:
         with contextlib.suppress(UserError):  # reported when the run is opened
             config = read_config(found.output / CONFIG_FILE)
             fields.append(("scene", tyro.conf.Positional[Path], field(default=config.scene)))
-        # The stored number of steps has been through the preset already.
+        # The preset has already been applied to the stored number of steps.
         steps = config.train.steps
         config = with_preset(config, found.preset)
         config = replace(config, train=replace(config.train, steps=steps))
@@ -111,7 +112,7 @@ def command_for(arguments: list[str]) -> type[Command]:
 
 
 def run(command: Command) -> None:
-    """Trains, with progress on the console; one of several processes where torchrun started it."""
+    """Trains with progress on the console, alone or as one of torchrun's processes."""
     import wildgs
     from wildgs.engine.distributed import join
 
@@ -145,10 +146,10 @@ def run(command: Command) -> None:
 
 
 def _refuse_changes(command: Command, config: RunConfig) -> None:
-    """Names the options by which a resumed run would become another one.
+    """Checks that no option of a resumed run changes its result.
 
     Raises:
-        UserError: There are some, or there is no run.
+        UserError: An option differs from the run's configuration, or there is no run.
     """
     differing = differing_entries(read_config(command.output / CONFIG_FILE), config)
     differing.pop(BUDGET, None)
@@ -165,5 +166,5 @@ def _refuse_changes(command: Command, config: RunConfig) -> None:
 def _window(command: Command) -> TrainingWindow:
     from wildgs.viewer.serving import TrainingWindow, import_viser
 
-    import_viser()  # its absence is reported before photos are read
+    import_viser()  # reports a missing viser before photos are read
     return TrainingWindow(command.server, command.output.resolve().name, announce=console.print)

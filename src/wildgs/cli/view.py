@@ -1,4 +1,4 @@
-"""`wildgs view`: fly through a run in the browser, under any light."""
+"""`wildgs view`: opens a run in the browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wildgs.viewer.config import ServerConfig, ViewerConfig
 
 @dataclass(frozen=True)
 class Command:
-    """Opens a run in the browser: fly, change the light, stand where photos were taken, record a path.
+    """Opens a run in the browser: navigate, change the light, jump to the photos' viewpoints, record a camera path.
 
     Example: wildgs view runs/gate
     """
@@ -26,7 +26,7 @@ class Command:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     appearance: tuple[str, ...] = ()
-    """One or two lights to begin with: photos of the scene by name, or files."""
+    """One or two initial appearances: names of photos of the scene, or files."""
     server: tyro.conf.OmitArgPrefixes[ServerConfig] = field(default_factory=ServerConfig)
     viewer: tyro.conf.OmitArgPrefixes[ViewerConfig] = field(default_factory=ViewerConfig)
 
@@ -49,4 +49,4 @@ def run(command: Command) -> None:
     except TerminatedError as ended:
         print(ended, file=sys.stderr, flush=True)
         atexit._run_exitfuncs()  # temporary folders
-        os._exit(ended.code)  # the page is closed; the server's threads may abort the interpreter's own end
+        os._exit(ended.code)  # the server's threads may crash a normal interpreter shutdown

@@ -12,22 +12,22 @@ from wildgs.model.config import DropoutConfig, Precision
 
 @dataclass(frozen=True)
 class ScheduleConfig:
-    """Steps are the paper's, of 30,000; a run of another length scales them (floors keep short runs sane).
+    """Training schedule. Step counts are for 30,000 steps and are scaled for a run of another length.
 
     Attributes:
-        first_stage: Steps without triplane and depth loss, until the mask is useful.
-        densify_from: First densification (3DGS: 500).
-        densify_until: Last densification and reset. By default the strategy's: 24,000 for relocation, and 15,000
-            (3DGS) for the others.
-        densify_every: Between densifications (3DGS: 100); 0 = no densification, pruning and opacity resets.
-        reset_every: Between opacity resets; 0 = no resets. By default 3,000 for 3DGS and affine, and none for
-            Wild-GS and with the strategy relocation.
-        mask_pause: Steps after an opacity reset in which the mask does not learn: the spike in the loss looks
-            like a transient.
-        sh_every: Between raises of the active SH degree (3DGS: 1,000).
-        encoder_every: The photo's encoder learns on one step in so many (not scaled; paper: 1).
-        mask_every: The visibility mask learns on one step in so many (not scaled; paper: 1).
-        planes_every: The triplane's UNet learns on one step in so many (not scaled; paper: 1).
+        first_stage: Length of the first stage in steps: no triplane and no depth loss until the mask is useful.
+        densify_from: Step of the first densification (3DGS: 500).
+        densify_until: Step of the last densification and opacity reset. Default: 24,000 with the strategy
+            relocation, 15,000 (3DGS) with the others.
+        densify_every: Steps between densifications (3DGS: 100); 0 = no densification, pruning or opacity resets.
+        reset_every: Steps between opacity resets; 0 = no resets. Default: 3,000 for 3dgs and affine; none for
+            wildgs, nor with the strategy relocation.
+        mask_pause: Steps after an opacity reset during which the mask is not trained, because it would mistake the
+            spike in the loss for a transient.
+        sh_every: Steps between increases of the active SH degree (3DGS: 1,000).
+        encoder_every: Train the image encoder every n-th step (not scaled; paper: 1).
+        mask_every: Train the visibility mask every n-th step (not scaled; paper: 1).
+        planes_every: Train the triplane's UNet every n-th step (not scaled; paper: 1).
     """
 
     first_stage: int = 3000
@@ -42,7 +42,7 @@ class ScheduleConfig:
     planes_every: int = 2
 
     def __post_init__(self) -> None:
-        """Refuses negative steps, and 0 where it means nothing."""
+        """Validates the step counts."""
         for name, value in vars(self).items():
             least = 1 if name in ("sh_every", "encoder_every", "mask_every", "planes_every") else 0
             if value is not None and value < least:
@@ -51,18 +51,18 @@ class ScheduleConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Learning rates of the geometry, 3DGS's; a method has those of its own parameters (`model.learning_rates`).
+    """Learning rates of the geometry, as in 3DGS. Those of a method's other parameters: `model.learning_rates`.
 
     Attributes:
-        means: Position, at the start, per unit of scene extent.
-        means_final: Position, at the end, per unit of scene extent.
-        scales: Logarithms of the scales.
-        quats: Orientations.
-        opacities: Opacity logits.
-        short_runs: Rates of positions, scales and orientations are multiplied by (30,000 / steps) to this power in
-            runs of fewer than 30,000 steps, for which 3DGS's were chosen. Not in 3DGS.
-        batch_scaling: How Adam changes where one of its steps is the mean over K photos (K processes). 'sqrt':
-            rates times the square root of K, beta to the power K, eps over the square root of K; 'none': not.
+        means: Initial learning rate of positions, per unit of scene extent.
+        means_final: Final learning rate of positions, per unit of scene extent.
+        scales: Learning rate of log scales.
+        quats: Learning rate of orientations.
+        opacities: Learning rate of opacity logits.
+        short_runs: In runs of fewer than 30,000 steps, learning rates of positions, scales and orientations are
+            multiplied by (30,000 / steps) to this power. 0 = unchanged, as in 3DGS.
+        batch_scaling: Adjustment of Adam when a step averages over K photos (K processes). 'sqrt': learning rates
+            times the square root of K, beta to the power K, eps divided by the square root of K; 'none': unchanged.
     """
 
     means: float = 1.6e-4
@@ -79,29 +79,29 @@ Strategy = Literal["classic", "absgrad", "relocation"]
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Which Gaussians are added and taken away. Values are 3DGS's, but for those of relocation.
+    """Densification and pruning of Gaussians. Defaults are those of 3DGS except for the strategy relocation.
 
     Attributes:
-        strategy: 'classic' is 3DGS's: clones and splits by screen gradients; 'absgrad' reads absolute gradients
-            (AbsGS); 'relocation' splits what covers most error, and takes away what shows nothing. By default
-            relocation for Wild-GS, else classic.
-        grow_gradient: Mean screen gradient above which a Gaussian grows, per half picture (3DGS's normalised
-            device coordinates); absgrad multiplies it by 4.
-        split_scale: Gaussians larger than this share of the scene's extent split; smaller ones are cloned.
-        prune_opacity: Fainter Gaussians go.
-        prune_scale: Gaussians larger than this share of the extent go, once opacities were reset before.
-        prune_by_distance: Whether, beyond the extent, that is a share of their distance from the middle: what is
-            far may be as large. Not in 3DGS.
-        prune_reach: Gaussians that reach further than this share of a picture's longer side go, likewise: most
-            of them float right before a camera and stand for what stood in its way; 0 = none. Not in 3DGS.
-        reset_opacity: Opacities are lowered to this at a reset.
-        reset_unseen: Whether resets also lower those of Gaussians that no photo has shown yet, as 3DGS does: no
-            photo would raise them again.
-        grow_share: Of relocation: share of the Gaussians that one round splits, and that it takes away, at most.
-        grow_error: Of relocation: error that a Gaussian covers, below which it is not split; pixels times error,
-            mean over the photos that see it.
-        least_pixels: Of relocation: Gaussians that cover fewer pixels of any photo go.
-        max_gaussians: Upper bound on the number of Gaussians, from the start.
+        strategy: 'classic' (3DGS) clones and splits Gaussians with large view-space positional gradients;
+            'absgrad' uses absolute gradients (AbsGS); 'relocation' splits the Gaussians that cover most of the
+            rendering error and prunes those that contribute least. Default: relocation for wildgs, else classic.
+        grow_gradient: Densify Gaussians whose mean view-space gradient, in normalised device coordinates, exceeds
+            this; absgrad uses four times this value.
+        split_scale: Gaussians larger than this fraction of the scene extent are split; smaller ones are cloned.
+        prune_opacity: Prune Gaussians whose opacity is lower.
+        prune_scale: After the first opacity reset, prune Gaussians larger than this fraction of the scene extent.
+        prune_by_distance: For Gaussians outside the scene extent, apply --density.prune-scale to their distance from
+            the scene centre, since distant Gaussians may be larger. Not in 3DGS.
+        prune_reach: After the first opacity reset, prune Gaussians whose projected radius exceeds this fraction of an
+            image's longer side; most are floaters close to a camera. 0 = off. Not in 3DGS.
+        reset_opacity: Upper bound to which an opacity reset lowers opacities.
+        reset_unseen: Also reset Gaussians that no photo has seen yet, as 3DGS does; no photo would raise their
+            opacity again.
+        grow_share: Strategy relocation: largest fraction of the Gaussians split, and pruned, at a time.
+        grow_error: Strategy relocation: do not split Gaussians that cover less error (sum over pixels, mean over the
+            photos that see them).
+        least_pixels: Strategy relocation: prune Gaussians that cover fewer pixels in every photo.
+        max_gaussians: Upper bound on the number of Gaussians, initial ones included.
     """
 
     strategy: Strategy | None = None
@@ -124,12 +124,12 @@ class TrainConfig:
     """Training.
 
     Attributes:
-        steps: Training steps (paper: 30,000; '†': 15,000). A step is one photo: K processes take K steps at once.
+        steps: Training steps (paper: 30,000; '†': 15,000). One photo is one step: K processes take K steps at a time.
         seed: Random seed.
-        precision: Precision of the networks; 'auto' is bfloat16 where the hardware is fast at it.
+        precision: Precision of the networks; 'auto' uses bfloat16 on hardware that accelerates it.
         objective: Loss weights.
         schedule: Training schedule.
-        optimizer: Learning rates.
+        optimizer: Learning rates of the geometry.
         density: Densification and pruning.
         dropout: Dropout of Gaussians, for scenes of few photos.
     """
@@ -144,6 +144,6 @@ class TrainConfig:
     dropout: DropoutConfig = field(default_factory=DropoutConfig)
 
     def __post_init__(self) -> None:
-        """Refuses a run without a step."""
+        """Validates the number of steps."""
         if self.steps < 1:
             raise UserError(f"steps {self.steps}: must be 1 or more")

@@ -17,19 +17,18 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class CleanupConfig:
-    """What an export drops.
+    """Reduction of exported files.
 
     Attributes:
-        min_opacity: Gaussians with a lower opacity are dropped.
-        max_distance: Gaussians further from the median of the SfM points are dropped. World units (the median depth
-            of the photos is 1); None keeps all.
-        crop: Gaussians outside the bounding box of nearly all SfM points, scaled by this factor, are dropped; None
-            keeps all.
-        drop_sky: The Gaussians that stand for the sky are dropped.
-        sh_degree: Spherical harmonics are truncated to this degree, fitted to the viewing directions of the photos;
-            None keeps all.
-        own_harmonics: Of files with several lights: share of the Gaussians that keep their own harmonics above
-            degree 0 in each light of a .glb; the others share them between all lights. 1 shares nothing.
+        min_opacity: Drop Gaussians with a lower opacity.
+        max_distance: Drop Gaussians farther than this from the median of the SfM points, in units of the aligned frame
+            (median depth of the photos = 1); None keeps all.
+        crop: Drop Gaussians outside the bounding box of nearly all SfM points, scaled by this factor; None keeps all.
+        drop_sky: Drop the Gaussians of the sky.
+        sh_degree: Truncate spherical harmonics to this degree, fitted to the viewing directions of the photos; None
+            keeps all degrees.
+        own_harmonics: For .glb files with several lights: fraction of the Gaussians that have separate harmonics above
+            degree 0 for each light; the others use the same ones for all lights. 1 = all separate.
     """
 
     min_opacity: float = 0.0
@@ -40,7 +39,7 @@ class CleanupConfig:
     own_harmonics: float = 0.09
 
     def __post_init__(self) -> None:
-        """Refuses values that mean nothing, NaN among them."""
+        """Validates the values; NaN is rejected as well."""
         for name, (least, most) in _RANGES.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -48,5 +47,5 @@ class CleanupConfig:
 
     @property
     def active(self) -> bool:
-        """Whether anything may be dropped."""
+        """Whether any option may drop something."""
         return replace(self, own_harmonics=CleanupConfig.own_harmonics) != CleanupConfig()

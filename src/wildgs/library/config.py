@@ -1,4 +1,4 @@
-"""Options of the library's functions: plain dataclasses, importable without torch."""
+"""Options of the library's functions: plain dataclasses that do not import torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wildgs.model.registry import DEFAULT_METHOD, METHODS
 from wildgs.presets import PRESET_NAMES, PresetName
 
 ExportFormat = Literal["html", "glb", "usd", "ply", "compressed.ply", "splat", "spz", "sog"]
-"""Files with several lights (the page, glTF, OpenUSD), and files with one."""
+"""Formats for several appearances per file (html, glb, usd), and formats for one."""
 
 Suite = Literal["phototourism"]
 HALF = "-half-steps"
@@ -24,21 +24,21 @@ BENCH_METHODS: tuple[str, ...] = (
     *PRESET_NAMES,
     *(WITHOUT + part for part in get_args(Ablation)),
 )
-"""Lines that a benchmark can have: methods, half of the steps, presets, and the ablations of Wild-GS."""
+"""Rows that a benchmark can have: methods, Wild-GS with half the steps, presets, and the ablations of Wild-GS."""
 
 
 def reference_preset(suite: Suite | None) -> PresetName:
-    """The preset that `wildgs`, its half-length run and its ablations stand for in a benchmark's table.
+    """The preset of the rows `wildgs`, `wildgs-half-steps` and the ablations in a benchmark's table.
 
-    The figures of the paper are those of the paper's own method, hence the preset `paper` for its suite.
+    It is `paper` for the paper's suite, since these rows are compared with the paper's figures.
     """
     return "default" if suite is None else "paper"
 
 
 def default_bench_methods(suite: Suite | None) -> tuple[str, ...]:
-    """All of `BENCH_METHODS` but the preset that `wildgs` stands for already, and what it has nothing of.
+    """All of `BENCH_METHODS` except the preset of the row `wildgs` and ablations that do not apply to it.
 
-    The default has no 3D Wrapping, of which parts could be left out.
+    The default has no 3D Wrapping, so that the ablations of its parts do not apply.
     """
     absent = [WITHOUT + part for part in WRAPPING_PARTS] if suite is None else []
     return tuple(name for name in BENCH_METHODS if name not in (reference_preset(suite), *absent))
@@ -46,18 +46,18 @@ def default_bench_methods(suite: Suite | None) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class MixOptions:
-    """How appearances are found and mixed."""
+    """How appearances are obtained and mixed."""
 
     weights: tuple[float, ...] = ()
-    """Mix the appearances into one with these weights, which add up to 1."""
+    """Mix the appearances into one with these weights, which must sum to 1."""
     global_: Annotated[str | None, tyro.conf.arg(name="global")] = None
-    """Take the global colour and brightness from this appearance instead."""
+    """Use the global colour and brightness of this appearance instead."""
     local: str | None = None
-    """Take local effects (shadows, lamps) from this appearance instead."""
+    """Use the local effects (shadows, lamps) of this appearance instead."""
     like: str | None = None
-    """Photo of the scene whose camera and depth a picture borrows instead of being localised, or auto."""
+    """Photo of the scene whose camera and depth are used for a new image instead of localising it; auto selects one."""
     sky: str | None = None
-    """Take the sky from this appearance instead."""
+    """Use the sky of this appearance instead."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,11 @@ class TrajectoryOptions:
     """A camera path and its frames."""
 
     path: str | None = None
-    """orbit, training, spiral, views (through --view), still (at --view), or a camera file (docs/cameras.md)."""
+    """Camera path: orbit, training, spiral, views (through --view), still (at --view), or a camera file
+    (docs/cameras.md)."""
     seconds: float | None = None
-    """Length of the video in seconds; by default 5, and 10 for --over day."""
+    """Length of the video in seconds. Default: 5, or 10 with --over day."""
     fps: float | None = None
-    """Frames per second; by default 30, or the camera file's own."""
+    """Frames per second. Default: that of the camera file, else 30."""
     size: tuple[int, int] | None = None
-    """Width and height in pixels; by default those of the photos."""
+    """Width and height in pixels. Default: those of the photos."""

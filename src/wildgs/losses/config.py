@@ -8,18 +8,18 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """Weights of the total loss (paper's equation of L_total).
+    """Weights of the total loss L_total.
 
     Attributes:
-        weight_l1: λ^I, share of L1 against structural dissimilarity in the image loss.
+        weight_l1: λ^I, weight of L1 in the image loss; D-SSIM has 1 - λ^I.
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
         depth_weight: λ^D (paper: 0.05).
-        metric_weight: Weight of the error against metric depth, where there is any. Not in the paper.
-        mask_gradient: What the mask learns from in the image loss. 'loss': the formula's own gradient, as printed;
-            'evidence': what the pixel shows (`wildgs.losses.photometric.transient_evidence`). The value of the loss
-            and its gradient to the render are the same.
-        min_alpha: Least accumulated alpha of a pixel whose rendered depth is compared.
+        metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
+        mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
+            'evidence': a robust measure of how transient a pixel is
+            (`wildgs.losses.photometric.transient_evidence`). Neither changes the loss nor its gradient to the render.
+        min_alpha: Smallest accumulated alpha of a pixel that enters the depth loss.
     """
 
     weight_l1: float = 0.8
@@ -31,6 +31,6 @@ class ObjectiveConfig:
     min_alpha: float = 0.5
 
     def mask_weight(self, progress: float) -> float:
-        """λ^M at a share of the training, 0 at its start and 1 at its end (clamped)."""
+        """λ^M at a fraction of the training, 0 at its start and 1 at its end (clamped)."""
         share = min(max(progress, 0.0), 1.0)
         return self.mask_weight_start + (self.mask_weight_end - self.mask_weight_start) * share

@@ -35,16 +35,15 @@ class ParsingConfig:
     """2D Parsing.
 
     Attributes:
-        encoder: `squeezenet` for the frozen features that ship with the package; else a ResNet-18 that learns: its
-            folder or hub name (paper: `microsoft/resnet-18`).
-        max_side: Photos are shrunk to this many pixels on the long side before parsing; the mask is blurry
-            anyway, and cost grows with the square.
-        color_statistics: Whether M^G also reads mean and spread of the photo's own colours. Not in the paper; but
-            what five stages leave of a photo says little of its colour cast.
+        encoder: Image encoder: `squeezenet`, frozen and part of the package, or the folder or hub name of a
+            ResNet-18, which is fine-tuned (paper: `microsoft/resnet-18`).
+        max_side: Resize photos to at most this many pixels on the longer side before parsing.
+        color_statistics: Also feed mean and standard deviation of the photo's colours to the global embedding's MLP;
+            the encoder's deep features carry little of the colour cast. Not in the paper.
         global_size: Length of the global embedding (paper: 16).
-        decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4.
-        bounded_logits: Whether M stays where its sigmoid passes a gradient, so that masks which closed or opened
-            everywhere can come back. Not in the paper.
+        decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4 of the resolution.
+        bounded_logits: Bound the mask's logits so that its sigmoid cannot saturate and a mask that is 0 or 1
+            everywhere can recover. Not in the paper.
     """
 
     encoder: str = SQUEEZENET
@@ -60,15 +59,14 @@ class WrappingConfig:
     """3D Wrapping.
 
     Attributes:
-        resolution: Cells per side of a plane.
+        resolution: Cells along each side of a plane.
         features: Channels of a plane's feature map.
         widths: Channels of the plane UNet, from full resolution down.
         local_size: Length of the local embedding (paper: 16).
-        crop_ratio: Share of the robust box's sides that the triplane covers (paper: 0.5).
-        box_quantile: Share of SfM points outside the robust box on each side of each axis.
-        partial_lifts: Share of the training steps in which a part of the photo is lifted only. Not in the paper,
-            where every Gaussian that is seen finds its own pixels in the planes, and those that a photo does not
-            show get whatever light comes out.
+        crop_ratio: Side of the triplane as a fraction of the robust bounding box's side (paper: 0.5).
+        box_quantile: Fraction of SfM points outside the robust bounding box at each end of each axis.
+        partial_lifts: Fraction of training steps that lift only a part of the photo, so that the planes also learn
+            to light Gaussians that the photo does not show. Not in the paper.
     """
 
     resolution: int = 64
@@ -80,7 +78,7 @@ class WrappingConfig:
     partial_lifts: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuses planes that no memory holds, and shares that are none."""
+        """Validates the values."""
         for name, (least, most) in WRAPPING_RANGES.items():
             value = getattr(self, name)
             if not least <= value <= most:
@@ -98,10 +96,10 @@ class FusionConfig:
         hidden: Width of the two hidden layers.
         sh_degree: Degree of the predicted spherical harmonics (paper: 3, as 3DGS has).
         output_scale: Factor on the output layer's initial weights.
-        color_transform: Whether Emb^g also gives one affine map of colours, the same for all Gaussians: a photo's
-            exposure and colour cast. Not in the paper, whose hidden layers have to learn to multiply for it.
-        direct_path: Whether a linear path from the intrinsic feature to the output runs beside the hidden layers:
-            training then begins at the points' colours. Not in the paper.
+        color_transform: Predict an affine colour transform from the global embedding, shared by all Gaussians, for
+            the photo's exposure and colour cast. Not in the paper.
+        direct_path: Add a linear skip connection from the intrinsic feature to the output, so that training starts
+            from the colours of the SfM points. Not in the paper.
     """
 
     intrinsic_size: int = 32
@@ -112,10 +110,10 @@ class FusionConfig:
     direct_path: bool = True
 
     def __post_init__(self) -> None:
-        """Refuses sizes that no network can have."""
+        """Validates the sizes."""
         if self.intrinsic_size < 3:
             raise UserError(
-                f"intrinsic_size {self.intrinsic_size}: must be 3 or more, since it holds a Gaussian's first colour"
+                f"intrinsic_size {self.intrinsic_size}: must be 3 or more, since it starts with a Gaussian's colour"
             )
         if self.hidden < 1:
             raise UserError(f"hidden {self.hidden}: must be 1 or more")
@@ -125,18 +123,17 @@ class FusionConfig:
 
 @dataclass(frozen=True)
 class SkyConfig:
-    """The shell of Gaussians that stands for the sky at the start.
+    """Initial Gaussians of the sky, on a sphere around the scene.
 
     Attributes:
-        points: How many; 0 leaves the sky to densification, as the paper does.
-        radius: Of the shell, in units of the aligned frame (photos' median depth); more where the scene's points
-            reach further.
-        reach: The shell lies at this multiple of the distance within which nearly all points are, at least.
-        lowest: Elevation at which the shell ends, degrees. Below the horizon it closes the scene behind ground that
-            too few photos show: such holes are as dark as the background otherwise.
-        opacity: Of its Gaussians at the start.
-        densify: Whether its Gaussians are cloned and split as others are: clouds, which no two photos share, then
-            take up to half of the budget.
+        points: Number of initial sky Gaussians; 0 leaves the sky to densification, as in the paper.
+        radius: Smallest radius of the sphere, in units of the aligned frame (median depth of the photos = 1).
+        reach: Smallest radius of the sphere as a multiple of the radius that contains nearly all SfM points.
+        lowest: Lowest elevation of sky Gaussians, degrees. Those below the horizon fill holes in the ground that
+            would otherwise show the dark background.
+        opacity: Initial opacity of the sky Gaussians.
+        densify: Densify sky Gaussians as well. Clouds differ between photos and can then take up to half of all
+            Gaussians.
     """
 
     points: int = 5000
@@ -149,12 +146,12 @@ class SkyConfig:
 
 @dataclass(frozen=True)
 class InitialConfig:
-    """Gaussians at the start beside those on SfM points. None of them is in the paper.
+    """Initial Gaussians in addition to those on SfM points. None of them is in the paper.
 
     Attributes:
-        depth_points: On surfaces that depth priors show and SfM has no points of.
-        ground: That continue the ground.
-        sky: That stand for the sky.
+        depth_points: Initial Gaussians on surfaces that depth maps show but SfM has no points on.
+        ground: Initial Gaussians that extend the ground plane.
+        sky: Initial Gaussians of the sky.
     """
 
     depth_points: DepthPointsConfig = field(default_factory=DepthPointsConfig)
@@ -163,7 +160,7 @@ class InitialConfig:
 
     @classmethod
     def sfm_only(cls) -> InitialConfig:
-        """SfM points alone, as 3DGS starts."""
+        """SfM points only, as in 3DGS."""
         return cls(DepthPointsConfig(points=0), GroundConfig(points=0), SkyConfig(points=0))
 
 
@@ -172,8 +169,8 @@ class LearningRate:
     """A learning rate that decays exponentially.
 
     Attributes:
-        start: At the first step.
-        decay: Factor reached at the last step; 1 keeps the rate constant.
+        start: Learning rate at the first step.
+        decay: Ratio of the last step's learning rate to the first one's; 1 keeps the rate constant.
     """
 
     start: float
@@ -182,13 +179,13 @@ class LearningRate:
 
 @dataclass(frozen=True)
 class MemoryUse:
-    """What training a method takes beside the decoded photos, bytes; `benchmarks/memory.py` measures it.
+    """Memory that training a method takes in addition to decoded photos, bytes (measured by `benchmarks/memory.py`).
 
     Attributes:
-        per_gaussian: Parameters, gradients, Adam's moments, the copies of densification, and the intermediate
-            values of one view.
-        per_pixel: Of the largest photo, at the size at which it trains.
-        fixed: Networks with their moments and activations, and compiled kernels.
+        per_gaussian: Bytes per Gaussian: parameters, gradients, Adam's moments, the copies made by densification, and
+            intermediate results of one view.
+        per_pixel: Bytes per pixel of the largest training image.
+        fixed: Networks with Adam's moments and activations, and compiled kernels.
     """
 
     per_gaussian: int
@@ -198,14 +195,14 @@ class MemoryUse:
 
 @dataclass(frozen=True)
 class WildGSRates:
-    """Learning rates of what plain 3DGS does not have.
+    """Learning rates of networks and intrinsic features.
 
     Attributes:
-        intrinsic: Intrinsic features, at the start.
-        networks: All networks but the encoder, at the start.
-        encoder: The encoder, at the start. At the networks' rate most of its rectifiers die within a few
-            thousand steps, and the embedding of every photo becomes the same.
-        decay: Factor that all three reach at the end, exponentially.
+        intrinsic: Initial learning rate of intrinsic features.
+        networks: Initial learning rate of all networks except the encoder.
+        encoder: Initial learning rate of the encoder. At the networks' rate most of its ReLUs die within a few
+            thousand steps, and all photos get the same embedding.
+        decay: Ratio of the final to the initial learning rate of all three; the decay is exponential.
     """
 
     intrinsic: float = 2.5e-3
@@ -219,27 +216,27 @@ class WildGSConfig:
     """Wild-GS.
 
     Attributes:
-        without: Parts left out, for ablations.
-        mask_threshold: Th: pixels above it are static (lifting, depth loss).
+        without: Parts to leave out, for ablations.
+        mask_threshold: Threshold Th: pixels with a higher visibility are static (used by lifting and depth loss).
         parsing: 2D Parsing.
-        local_embeddings: Whether 3D Wrapping gives every Gaussian a local embedding of the photo. In the paper it
-            does; by default light codes carry what of the light varies over the scene.
+        local_embeddings: Give every Gaussian a local embedding of the photo by 3D Wrapping, as in the paper. By
+            default --light-codes represent lighting that varies over the scene.
         wrapping: 3D Wrapping.
         fusion: The fusion network.
-        depth_points: Gaussians on what depth priors see and SfM has no points of, at the start.
-        ground: Gaussians that continue the ground at the start.
-        sky: Gaussians that stand for the sky at the start.
-        color_match: Whether a photo's light is read in two steps: from its embedding, and then from how far the
-            scene's colours under that are from the photo's. Not in the paper.
-        matched_loss: How much of the colour match a training render gets before it is compared with its photo, from
-            0 to 1. Not in the paper.
-        light_codes: Numbers per Gaussian, linear in f^in, with which a photo's change of colours may vary over the
-            landmark; 0 for none. Not in the paper.
-        light_components: Size of the basis of lights in which a photo's light is fitted after the colour match
-            (`wildgs.model.light_basis`); 0 for none. Not in the paper.
-        eps2d: Added to the diagonal of the Gaussians' 2D covariances, square pixels. 3DGS has 0.3, which
-            blurs what is as small as a pixel.
-        learning_rates: Of networks and intrinsic features.
+        depth_points: Initial Gaussians on surfaces that depth maps show but SfM has no points on.
+        ground: Initial Gaussians that extend the ground plane.
+        sky: Initial Gaussians of the sky.
+        color_match: After embedding a photo, fit a colour transform between the render under that embedding and the
+            photo, and apply it to the scene's colours. Not in the paper.
+        matched_loss: Fraction of the colour match that is applied to a training render before the loss, 0 to 1. Not
+            in the paper.
+        light_codes: Light codes per Gaussian, linear in its intrinsic feature, by which a photo's colour transform
+            varies over the scene; 0 = none. Not in the paper.
+        light_components: Components of the light basis in which a photo's light is fitted after the colour match
+            (`wildgs.model.light_basis`); 0 = none. Not in the paper.
+        eps2d: Added to the diagonal of projected 2D covariances, in square pixels. 3DGS uses 0.3, which blurs
+            pixel-sized detail.
+        learning_rates: Learning rates of networks and intrinsic features.
     """
 
     without: tuple[Ablation, ...] = ()
@@ -259,22 +256,22 @@ class WildGSConfig:
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
     def __post_init__(self) -> None:
-        """Refuses to leave out what is not there."""
+        """Rejects ablations of parts that are off."""
         absent = [part for part in WRAPPING_PARTS if part in self.without]
         if absent and not self.local_embeddings:
             raise UserError(
-                f"without {', '.join(absent)}: that is a part of 3D Wrapping, which is off; "
-                "use it with --local-embeddings or --preset paper"
+                f"--without {', '.join(absent)}: this is a part of 3D Wrapping, which is off; "
+                "add --local-embeddings or --preset paper"
             )
 
 
 @dataclass(frozen=True)
 class VanillaRates:
-    """Learning rates of the harmonics; values are 3DGS's.
+    """Learning rates of the spherical harmonics, as in 3DGS.
 
     Attributes:
-        sh0: Flat colour.
-        shN: Higher harmonics.
+        sh0: Learning rate of degree 0.
+        shN: Learning rate of higher degrees.
     """
 
     sh0: float = 2.5e-3
@@ -286,7 +283,7 @@ class VanillaConfig:
     """Plain 3D Gaussian Splatting.
 
     Attributes:
-        learning_rates: Of the harmonics.
+        learning_rates: Learning rates of the spherical harmonics.
     """
 
     learning_rates: VanillaRates = field(default_factory=VanillaRates)
@@ -297,10 +294,9 @@ class DropoutConfig:
     """Dropout of Gaussians in training (`wildgs.model.dropout`). Not in the paper.
 
     Attributes:
-        rate: Share of the Gaussians that is left out at the end of training, with few photos; it grows linearly.
-            0 leaves none out.
-        photos: From so many training photos on nothing is left out; half as many halve the rate.
-        neighbours: Gaussians that are left out together.
+        rate: Dropout rate at the last step for a scene with very few photos; it grows linearly from 0. 0 = off.
+        photos: Number of training photos from which nothing is dropped; the rate falls linearly up to it.
+        neighbours: Number of neighbouring Gaussians that are dropped together.
     """
 
     rate: float = 0.0
@@ -308,11 +304,11 @@ class DropoutConfig:
     neighbours: int = 8
 
     def rate_at(self, progress: float, photos: int) -> float:
-        """Share of the Gaussians that is left out.
+        """The dropout rate at a point of training.
 
         Args:
-            progress: Share of the training done, 0 to 1.
-            photos: Training photos.
+            progress: Fraction of the training done, 0 to 1.
+            photos: Number of training photos.
         """
         few = 1.0 - photos / self.photos if self.photos else 0.0
         return self.rate * min(max(progress, 0.0), 1.0) * max(0.0, few)

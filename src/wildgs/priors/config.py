@@ -1,4 +1,4 @@
-"""Configuration of the first Gaussians that come from priors."""
+"""Configuration of depth estimation and of initial Gaussians from priors."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 
 @dataclass(frozen=True)
 class DepthPointsConfig:
-    """Initial points from depth priors; scenes without depth priors have none.
+    """Initial Gaussians from depth maps; scenes without depth maps have none.
 
     Attributes:
-        points: At most so many; 0 starts from SfM points alone, as the paper does.
-        cell: Side of the cells in which photos have to agree, in units of the aligned frame (photos' median depth).
-        support: Photos that have to see a surface in a cell.
-        agreement: Of the photos that look at a cell, least share that see the surface there and not beyond.
-        farthest: Nothing further from a camera than this, in units of the aligned frame.
+        points: Upper bound on the number of points; 0 starts from SfM points only, as in the paper.
+        cell: Size of the voxels in which photos have to agree, in units of the aligned frame (median depth of the
+            photos = 1).
+        support: Number of photos that have to see a surface in a voxel.
+        agreement: Smallest fraction of the photos looking at a voxel that see the surface in it rather than behind it.
+        farthest: Largest distance of a point from its camera, in units of the aligned frame.
     """
 
     points: int = 20_000
@@ -30,13 +31,13 @@ class DepthPointsConfig:
 
 @dataclass(frozen=True)
 class GroundConfig:
-    """Gaussians that continue the ground at the start, where it is level and known in part.
+    """Initial Gaussians that extend the ground plane, if the scene has a level ground.
 
     Attributes:
-        points: At most so many; 0 leaves holes, as the paper does.
-        spacing: Between them, in units of the aligned frame (photos' median depth).
-        reach: How far around the cameras the ground is continued, likewise.
-        tolerance: Height within which a point belongs to the plane, likewise.
+        points: Upper bound on the number of points; 0 = none, as in the paper.
+        spacing: Distance between points, in units of the aligned frame (median depth of the photos = 1).
+        reach: Distance from the cameras up to which the ground is extended, in units of the aligned frame.
+        tolerance: Largest distance of an inlier from the ground plane, in units of the aligned frame.
     """
 
     points: int = 6000
@@ -50,14 +51,14 @@ class StereoConfig:
     """Depth by multi-view stereo.
 
     Attributes:
-        max_side: Photos are compared at this size (longer side), pixels.
-        neighbours: Photos with which each is compared, at most.
-        agreeing: Neighbours that have to see the surface where a photo sees it.
-        max_cost: 1 - NCC of a window beyond which nothing is said.
-        tolerance: Difference of depth within which photos agree, as a share of it.
-        reach: Pixels within which a point carried to a neighbour and back has to arrive.
-        support: Pixels of the 7 x 7 around a pixel that its plane has to hold for.
-        seed: Of random planes.
+        max_side: Longer side of the photos for matching, pixels.
+        neighbours: Upper bound on the number of source photos per reference photo.
+        agreeing: Number of source photos that have to confirm a depth.
+        max_cost: Largest matching cost, 1 - NCC, of a pixel that gets a depth.
+        tolerance: Largest relative difference between depths that agree.
+        reach: Largest reprojection error, in pixels, from the reference photo to a source photo and back.
+        support: Number of pixels in a 7 x 7 window that have to agree with the plane of the central pixel.
+        seed: Random seed of the initial planes.
     """
 
     max_side: int = 400
@@ -70,7 +71,7 @@ class StereoConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuses values with which nothing can be compared, NaN among them."""
+        """Validates the values; NaN is rejected as well."""
         ranges = {
             "max_side": (32, 4096),
             "neighbours": (1, 64),

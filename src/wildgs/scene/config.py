@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from wildgs.errors import UserError
 
 MAX_IMAGE_PIXELS = 250_000_000
-"""Pictures with more pixels are refused unread: a small file can unpack to more than the memory holds."""
-
+"""Images with more pixels are rejected before decoding: a small file can decode to more than memory holds."""
 
 _UNITS = {"": 1, "B": 1} | {
     prefix + ending: base ** (power + 1)
@@ -18,7 +17,7 @@ _UNITS = {"": 1, "B": 1} | {
 }
 
 IMAGE_CACHE = "4GB"
-"""Memory for decoded photos unless another size is asked for."""
+"""Default size of the cache of decoded photos."""
 
 
 @dataclass(frozen=True)
@@ -26,21 +25,21 @@ class DataConfig:
     """How a scene folder is read."""
 
     downscale: int | float = 1
-    """Divides the photos' width and height (the paper: 2 on Phototourism)."""
+    """Factor by which the photos' width and height are divided (paper: 2 on Phototourism)."""
     max_side: int | None = None
-    """Reduces each photo, after --downscale, so that its own longer side is at most this many pixels; smaller ones
-    stay as they are."""
+    """Longest side of a photo in pixels, after --downscale; larger photos are reduced to it, smaller ones are not
+    changed."""
     holdout: int = 8
-    """Every n-th photo tests where the scene has no .tsv split; 0 = all train."""
+    """Hold out every n-th photo for testing if the scene has no .tsv split; 0 = train on all photos."""
     use_masks: bool = True
-    """Read the user's masks/ (0 = ignore)."""
+    """Use the masks in the scene's masks/ folder (0 = ignore the pixel)."""
     use_depth: bool = True
-    """Read the depth prior in depth/."""
+    """Use the depth maps in the scene's depth/ folder."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
-    """Pictures with more pixels are left out unread."""
+    """Skip photos with more pixels without decoding them."""
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing."""
+        """Validates the values."""
         if not 1 <= self.downscale < float("inf"):
             raise UserError(f"downscale {self.downscale}: must be 1 (full size) or more")
         if self.max_side is not None and self.max_side < 1:
@@ -52,10 +51,10 @@ class DataConfig:
 
 
 def parse_bytes(text: str) -> int:
-    """A size such as ``4GB``, ``500 MB`` or ``2GiB`` in bytes.
+    """Converts a size such as ``4GB``, ``500 MB`` or ``2GiB`` to bytes.
 
     Raises:
-        UserError: It is none.
+        UserError: The text is not a size.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     if match is None or match[2].upper() not in _UNITS:

@@ -10,16 +10,16 @@ from wildgs.scene.config import MAX_IMAGE_PIXELS
 
 @dataclass(frozen=True)
 class PairingConfig:
-    """When and how partners are chosen."""
+    """Selection of image pairs to match."""
 
     exhaustive_limit: int = 60
-    """Sets of up to this many photos are matched all with all."""
+    """Match all pairs in sets of up to this many photos."""
     neighbours: int = 16
-    """Partners per photo in larger sets."""
+    """Photos that each photo is matched with in larger sets."""
     gps_share: float = 0.8
-    """Share of the photos that must carry a GPS position for neighbours to be chosen by it."""
+    """Choose pairs by GPS position if at least this fraction of the photos has one."""
     gps_distance: float = 200.0
-    """Photos farther apart than this, in metres, are no neighbours by GPS."""
+    """Largest distance, in metres, between photos paired by GPS."""
 
 
 @dataclass(frozen=True)
@@ -27,17 +27,18 @@ class SfmConfig:
     """Structure from motion."""
 
     pairing: PairingConfig = field(default_factory=PairingConfig)
-    """Which photos are matched with which."""
+    """Selection of image pairs to match."""
     max_image_size: int = 2000
-    """Features are sought at no more than this many pixels on the long side."""
+    """Longest side in pixels at which features are extracted."""
     max_features: int = 8192
-    """Features per photo."""
+    """Upper bound on the number of features per photo."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
-    """Photos with more pixels are left out."""
+    """Skip photos with more pixels."""
     affine_features: bool = False
-    """Whether features have an affine shape, which survives oblique views; finding them takes 1.4 times as long."""
+    """Estimate the affine shape of features, which matches oblique views better; extraction takes 1.4 times as
+    long."""
     second_chance: bool = True
-    """Whether photos without a pose are matched to points, and with more partners, and tried again."""
+    """Try photos without a pose again: match them to 3D points and to more photos."""
     threads: int = -1
     """CPU threads; -1 = all."""
     seed: int = 0

@@ -9,13 +9,13 @@ LOCAL = "127.0.0.1"
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """Where the viewer is reached.
+    """Network address of the viewer.
 
     Attributes:
-        host: Address to listen on: 127.0.0.1 for local access only, 0.0.0.0 for all interfaces. Whoever has the
-            address with its token sees the photos and can use this machine's processor.
-        port: Port to listen on; the next free one where it is taken.
-        share: Also open a public address through viser's relay.
+        host: Address to listen on: 127.0.0.1 for local access only, 0.0.0.0 for all interfaces. Anyone with the
+            URL and its token can see the photos and use this machine's processor.
+        port: Port to listen on; if it is taken, the next free one.
+        share: Also create a public URL through viser's relay server.
     """
 
     host: str = LOCAL
@@ -25,10 +25,10 @@ class ServerConfig:
 
 @dataclass(frozen=True)
 class ViewerConfig:
-    """Contents of the viewer's page.
+    """Content of the viewer's page.
 
     Attributes:
-        photos: Number of photos shown as thumbnails and frustums; all others can be chosen by name.
+        photos: Number of photos shown as thumbnails and frustums; the others can be selected by name.
     """
 
     photos: int = 48
