@@ -79,8 +79,8 @@ class ExecutionConfig:
         log_every: Steps between entries of metrics.jsonl and TensorBoard.
         pictures_every: Steps between images on TensorBoard.
         cuda_graphs: Capture and replay the networks as CUDA graphs (on CUDA devices).
-        feature_cache: Memory for the frozen encoder's features of training photos; those of photos that do not fit are
-            computed again at every use.
+        feature_cache: Memory for the frozen encoder's features of training photos; those of photos that do not fit
+            are computed again at every use.
         threads: Number of CPU threads of kernels and torch. Default: WILDGS_NUM_THREADS, else all cores.
     """
 

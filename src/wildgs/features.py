@@ -16,10 +16,10 @@ FEATURES = {
     "triton_ssim": "SSIM and its gradient by four Triton kernels instead of convolutions",
     "triton_planes": "channels-last triplane sampling by Triton kernels instead of grid_sample",
     "spread_rejected": "spreads pixels that are not lifted over many cells of the scatter instead of one",
-    "split_weights": "sums weight gradients of the fusion network in parts instead of one product over all Gaussians",
-    "written_gradients": "writes gradients of replayed graphs by one autograd function instead of one accumulator each",
+    "split_weights": "sums weight gradients of the fusion network in parts instead of by one large product",
+    "written_gradients": "writes gradients of replayed graphs by one autograd function instead of accumulators",
     "skip_on_device": "skips non-finite steps on the device by fused Adam instead of waiting for the host",
-    "densify_once": "moves every tensor once in densification, in its final order, instead of sorting it afterwards",
+    "densify_once": "moves every tensor once in densification, in its final order, instead of twice",
     "checkpoint_thread": "writes checkpoints in a thread instead of the training loop",
 }
 

@@ -56,8 +56,8 @@ class TerminatedError(KeyboardInterrupt):
 def signals_as_interrupts() -> Iterator[None]:
     """Makes SIGTERM and SIGHUP raise `TerminatedError` in the block; a second signal kills the process.
 
-    Signals that the process ignores (nohup) stay ignored. Does nothing outside the main thread, where Python does not
-    allow signal handlers.
+    Signals that the process ignores (nohup) stay ignored. Does nothing outside the main thread, where Python does
+    not allow signal handlers.
     """
     previous: dict[int, Any] = {}
 

@@ -1,9 +1,9 @@
 """Runs a compiled kernel on several threads that take work items from one shared counter.
 
 A kernel releases the GIL and is called once per thread as `kernel(counter, *arguments)`; it takes work items with
-`fetch_add(counter, 1)` until none are left. The result of an item must not depend on the thread that computes it, so
-that results are the same for any number of threads. Numba's global thread pool is not used, so that several Python
-threads (autograd's backward thread, a viewer) may launch kernels at the same time.
+`fetch_add(counter, 1)` until none are left. The result of an item must not depend on the thread that computes it,
+so that results are the same for any number of threads. Numba's global thread pool is not used, so that several
+Python threads (autograd's backward thread, a viewer) may launch kernels at the same time.
 """
 
 from __future__ import annotations

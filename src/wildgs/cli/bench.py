@@ -45,8 +45,8 @@ class Command:
     """Trains and scores methods on scenes with several seeds and both protocols, and writes one table.
 
     Finished runs are skipped, so the same command continues after an interruption, and scenes, methods, variants or
-    seeds can be added later. The table (table.md, table.csv, table.json) is updated after every run. Several processes
-    with the same --output, started by torchrun or by hand, share the runs among them.
+    seeds can be added later. The table (table.md, table.csv, table.json) is updated after every run. Several
+    processes with the same --output, started by torchrun or by hand, share the runs among them.
 
     Example: wildgs bench scenes/gate --output bench --steps 3000 --downscale 2 --methods 3dgs wildgs
     """
@@ -56,8 +56,8 @@ class Command:
     output: Path = Path("wildgs-bench")
     """Folder for the runs and the table."""
     suite: Suite | None = None
-    """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, with the paper's figures for
-    comparison. Wild-GS and its ablations then use the preset paper; `default` is a separate row."""
+    """phototourism: brandenburg_gate, sacre_coeur and trevi_fountain at half resolution, with the paper's figures
+    for comparison. Wild-GS and its ablations then use the preset paper; `default` is a separate row."""
     methods: tuple[str, ...] | None = None
     """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART). Default:
     all."""
@@ -123,8 +123,8 @@ def _run(command: Command) -> None:
     if done.failures:
         title, reason = next(iter(done.failures.items()))
         raise UserError(
-            f"{len(done.failures)} of {done.runs} runs failed, first {title} ({reason}); run the same command again "
-            "to retry them"
+            f"{len(done.failures)} of {done.runs} runs failed, first {title} ({reason}); run the same command again to "
+            "retry them"
         )
 
 

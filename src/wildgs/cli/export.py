@@ -29,8 +29,8 @@ class Command:
     format: tuple[ExportFormat, ...] = ("html",)
     """One or more file formats."""
     appearance: tuple[str, ...] = ()
-    """Names of photos of the scene, files of new photos or any images, saved appearances, or neutral. Default: several
-    photos of very different light for html, glb and usd; neutral for the others."""
+    """Names of photos of the scene, files of new photos or any images, saved appearances, or neutral. Default:
+    several photos of very different light for html, glb and usd; neutral for the others."""
     mix: Mix = field(default_factory=MixOptions)
     output: Path | None = None
     """Folder for the files, or the file itself if only one is written. Default: RUN/export."""

@@ -34,8 +34,8 @@ class Command:
     max_side: int | None = None
     """Longest side of a photo in pixels; larger photos are reduced to it, smaller ones are not changed."""
     downscale: float | None = None
-    """Factor by which the photos' width and height are divided, before --max-side. If it is given without --max-side,
-    photos are not reduced further."""
+    """Factor by which the photos' width and height are divided, before --max-side. If it is given without
+    --max-side, photos are not reduced further."""
     max_gaussians: int | None = None
     """Upper bound on the number of Gaussians. Default: depends on the machine's memory."""
     holdout: int | None = None

@@ -58,7 +58,7 @@ class SafeStream:
     @property
     def _stream(self) -> Any:
         stream = getattr(sys, self._name)
-        # While a progress bar is shown, rich replaces both streams by proxies that write to the console, hence here.
+        # While a progress bar is shown, rich replaces both streams by proxies that write to the console.
         return getattr(stream, "rich_proxied_file", stream) if self._name == "stdout" else stream
 
     def write(self, text: str) -> int:

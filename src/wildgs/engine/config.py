@@ -90,16 +90,16 @@ class DensityConfig:
         split_scale: Gaussians larger than this fraction of the scene extent are split; smaller ones are cloned.
         prune_opacity: Prune Gaussians whose opacity is lower.
         prune_scale: After the first opacity reset, prune Gaussians larger than this fraction of the scene extent.
-        prune_by_distance: For Gaussians outside the scene extent, apply --density.prune-scale to their distance from
-            the scene centre, since distant Gaussians may be larger. Not in 3DGS.
-        prune_reach: After the first opacity reset, prune Gaussians whose projected radius exceeds this fraction of an
-            image's longer side; most are floaters close to a camera. 0 = off. Not in 3DGS.
+        prune_by_distance: For Gaussians outside the scene extent, apply --density.prune-scale to their distance
+            from the scene centre, since distant Gaussians may be larger. Not in 3DGS.
+        prune_reach: After the first opacity reset, prune Gaussians whose projected radius exceeds this fraction of
+            an image's longer side; most are floaters close to a camera. 0 = off. Not in 3DGS.
         reset_opacity: Upper bound to which an opacity reset lowers opacities.
         reset_unseen: Also reset Gaussians that no photo has seen yet, as 3DGS does; no photo would raise their
             opacity again.
         grow_share: Strategy relocation: largest fraction of the Gaussians split, and pruned, at a time.
-        grow_error: Strategy relocation: do not split Gaussians that cover less error (sum over pixels, mean over the
-            photos that see them).
+        grow_error: Strategy relocation: do not split Gaussians that cover less error (sum over pixels, mean over
+            the photos that see them).
         least_pixels: Strategy relocation: prune Gaussians that cover fewer pixels in every photo.
         max_gaussians: Upper bound on the number of Gaussians, initial ones included.
     """
@@ -124,7 +124,8 @@ class TrainConfig:
     """Training.
 
     Attributes:
-        steps: Training steps (paper: 30,000; '†': 15,000). One photo is one step: K processes take K steps at a time.
+        steps: Training steps (paper: 30,000; '†': 15,000). One photo is one step: K processes take K steps at a
+            time.
         seed: Random seed.
         precision: Precision of the networks; 'auto' uses bfloat16 on hardware that accelerates it.
         objective: Loss weights.

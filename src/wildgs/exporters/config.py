@@ -21,14 +21,15 @@ class CleanupConfig:
 
     Attributes:
         min_opacity: Drop Gaussians with a lower opacity.
-        max_distance: Drop Gaussians farther than this from the median of the SfM points, in units of the aligned frame
-            (median depth of the photos = 1); None keeps all.
-        crop: Drop Gaussians outside the bounding box of nearly all SfM points, scaled by this factor; None keeps all.
+        max_distance: Drop Gaussians farther than this from the median of the SfM points, in units of the aligned
+            frame (median depth of the photos = 1); None keeps all.
+        crop: Drop Gaussians outside the bounding box of nearly all SfM points, scaled by this factor; None keeps
+            all.
         drop_sky: Drop the Gaussians of the sky.
         sh_degree: Truncate spherical harmonics to this degree, fitted to the viewing directions of the photos; None
             keeps all degrees.
-        own_harmonics: For .glb files with several lights: fraction of the Gaussians that have separate harmonics above
-            degree 0 for each light; the others use the same ones for all lights. 1 = all separate.
+        own_harmonics: For .glb files with several lights: fraction of the Gaussians that have separate harmonics
+            above degree 0 for each light; the others use the same ones for all lights. 1 = all separate.
     """
 
     min_opacity: float = 0.0

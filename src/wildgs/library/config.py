@@ -55,7 +55,8 @@ class MixOptions:
     local: str | None = None
     """Use the local effects (shadows, lamps) of this appearance instead."""
     like: str | None = None
-    """Photo of the scene whose camera and depth are used for a new image instead of localising it; auto selects one."""
+    """Photo of the scene whose camera and depth are used for a new image instead of localising it; auto selects
+    one."""
     sky: str | None = None
     """Use the sky of this appearance instead."""
 

@@ -18,7 +18,8 @@ class ObjectiveConfig:
         metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
         mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
             'evidence': a robust measure of how transient a pixel is
-            (`wildgs.losses.photometric.transient_evidence`). Neither changes the loss nor its gradient to the render.
+            (`wildgs.losses.photometric.transient_evidence`). Neither changes the loss nor its gradient to the
+            render.
         min_alpha: Smallest accumulated alpha of a pixel that enters the depth loss.
     """
 

@@ -38,8 +38,8 @@ class ParsingConfig:
         encoder: Image encoder: `squeezenet`, frozen and part of the package, or the folder or hub name of a
             ResNet-18, which is fine-tuned (paper: `microsoft/resnet-18`).
         max_side: Resize photos to at most this many pixels on the longer side before parsing.
-        color_statistics: Also feed mean and standard deviation of the photo's colours to the global embedding's MLP;
-            the encoder's deep features carry little of the colour cast. Not in the paper.
+        color_statistics: Also feed mean and standard deviation of the photo's colours to the global embedding's
+            MLP; the encoder's deep features carry little of the colour cast. Not in the paper.
         global_size: Length of the global embedding (paper: 16).
         decoder_widths: Channels of the mask decoder at 1/16, 1/8 and 1/4 of the resolution.
         bounded_logits: Bound the mask's logits so that its sigmoid cannot saturate and a mask that is 0 or 1
@@ -179,11 +179,11 @@ class LearningRate:
 
 @dataclass(frozen=True)
 class MemoryUse:
-    """Memory that training a method takes in addition to decoded photos, bytes (measured by `benchmarks/memory.py`).
+    """Memory for training besides decoded photos, in bytes; measured by `benchmarks/memory.py`.
 
     Attributes:
-        per_gaussian: Bytes per Gaussian: parameters, gradients, Adam's moments, the copies made by densification, and
-            intermediate results of one view.
+        per_gaussian: Bytes per Gaussian: parameters, gradients, Adam's moments, the copies made by densification,
+            and intermediate results of one view.
         per_pixel: Bytes per pixel of the largest training image.
         fixed: Networks with Adam's moments and activations, and compiled kernels.
     """

@@ -18,7 +18,8 @@ class DepthPointsConfig:
         cell: Size of the voxels in which photos have to agree, in units of the aligned frame (median depth of the
             photos = 1).
         support: Number of photos that have to see a surface in a voxel.
-        agreement: Smallest fraction of the photos looking at a voxel that see the surface in it rather than behind it.
+        agreement: Smallest fraction of the photos looking at a voxel that see the surface in it rather than behind
+            it.
         farthest: Largest distance of a point from its camera, in units of the aligned frame.
     """
 
