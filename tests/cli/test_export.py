@@ -61,14 +61,14 @@ def test_what_is_left_out_and_its_cost_are_printed(wildgs, trained: Path, tmp_pa
     name = _names(trained)[0]
     assert wildgs("export", trained, "--format", "ply", "--appearance", name, "--output", tmp_path,
                   "--min-opacity", "0.09", "--sh-degree", "1", "--crop", "1") == 0  # fmt: skip
-    assert "dB PSNR against all of them" in capsys.readouterr().out
+    assert "dB PSNR against all Gaussians" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--appearance", "nobody.jpg"], "nobody.jpg"),
-        (["--format", "ply", "--min-opacity", "1"], "leave no Gaussian"),
+        (["--format", "ply", "--min-opacity", "1"], "drop all Gaussians"),
         (["--min-opacity", "2"], "--min-opacity 2.0: must be from 0 to 1"),
         (["--crop", "nan"], "--crop nan"),
         (["--sh-degree", "7"], "--sh-degree 7"),

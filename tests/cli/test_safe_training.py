@@ -142,7 +142,7 @@ def test_a_disk_without_locks_is_said_and_used(tmp_path: Path, monkeypatch: pyte
         raise NotImplementedError("no flock")
 
     monkeypatch.setattr("filelock.FileLock.acquire", refuse)
-    with pytest.warns(WildGSWarning, match="disk without locks"), lock_run(tmp_path / "run"):
+    with pytest.warns(WildGSWarning, match="file system without locks"), lock_run(tmp_path / "run"):
         (tmp_path / "run" / "file").touch()
 
 
@@ -203,7 +203,7 @@ def test_memory_that_runs_out_is_tried_again_with_fewer(
     run = tmp_path / "run"
     call_at_step(monkeypatch, 12, out_of_memory)
     assert wildgs("train", landmark, "--output", run, *TRAIN) == 0
-    assert "memory ran out; continuing from the newest checkpoint with at most" in capsys.readouterr().err
+    assert "out of memory; continuing from the newest checkpoint with at most" in capsys.readouterr().err
     loaded = load_run(run)
     budget = yaml.safe_load((run / "config.yaml").read_text())["train"]["density"]["max_gaussians"]
     assert loaded.step == 24
@@ -218,7 +218,7 @@ def test_memory_that_runs_out_twice_is_a_users_mistake(
 
     monkeypatch.setattr(Trainer, "_forward", forward)
     assert wildgs("train", landmark, "--output", tmp_path / "run", *TRAIN) == 2
-    assert "ran out again" in capsys.readouterr().err
+    assert "ran out of memory again" in capsys.readouterr().err
 
 
 def test_a_budget_below_the_points_holds_from_the_start(

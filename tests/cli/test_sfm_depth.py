@@ -118,7 +118,7 @@ def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pipeline, "load_depth_anything", Estimator)
-    monkeypatch.setattr(pipeline, "_pose", lambda *_: None)
+    monkeypatch.setattr(pipeline, "_estimate_poses", lambda *_: None)
     monkeypatch.setattr(pipeline, "train", stop)
     depth_folder.mkdir()
     Image.new("I;16", (48, 32)).save(depth_folder / "p00.png")

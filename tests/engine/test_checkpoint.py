@@ -182,7 +182,7 @@ def test_what_cannot_be_read_for_another_reason_is_not_called_damaged(
         raise error
 
     monkeypatch.setattr("wildgs.engine.checkpoint.safe_open", fail)
-    with pytest.raises(UserError, match=r"step_00000002.* cannot be read .*the file stays as it is"):
+    with pytest.raises(UserError, match=r"step_00000002.* cannot be read .*the file was not changed"):
         load_newest(tmp_path, set_aside=True)
     assert list_checkpoints(tmp_path) == kept
 

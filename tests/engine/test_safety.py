@@ -157,7 +157,7 @@ def test_no_photo_left_is_a_users_mistake(wall_scene: Scene, monkeypatch) -> Non
     trainer = trainer_for(wall_scene, 20)
     trainer.feed.views = tuple(replace(view, photos=GonePhotos()) for view in trainer.views)
     monkeypatch.setattr(trainer, "_prepare", lambda: None)
-    with pytest.warns(WildGSWarning), pytest.raises(UserError, match="no photo can be read any more"):
+    with pytest.warns(WildGSWarning), pytest.raises(UserError, match="cannot be read any more"):
         trainer.run()
 
 

@@ -134,7 +134,7 @@ def test_checkpoint_holds_all_that_training_needs(
 def test_a_scene_without_training_photos_is_a_users_mistake(
     wall_scene: Scene, tiny_model: WildGSConfig
 ) -> None:
-    with pytest.raises(UserError, match="no photo to train on"):
+    with pytest.raises(UserError, match="no training photo"):
         trainer_for(replace(wall_scene, views=wall_scene.test_views), tiny_model, 10)
 
 

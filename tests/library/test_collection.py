@@ -104,7 +104,7 @@ def test_options_that_are_left_out_are_those_of_the_run(tmp_path: Path) -> None:
 
 def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: Path) -> None:
     Image.fromarray(np.full((8, 8, 3), 200, dtype=np.uint8)).save(photos / "added.jpg")
-    with pytest.raises(UserError, match=r"other photos than .*added\.jpg.*--output"):
+    with pytest.raises(UserError, match=r"has changed since .*added\.jpg.*--output"):
         wildgs.run(photos, scene.parent)
     assert not (scene.parent / "checkpoints").exists()
 

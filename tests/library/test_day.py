@@ -109,7 +109,7 @@ def test_a_damaged_day_is_found_again(run: Path, change: dict) -> None:
 def test_original_photos_that_are_not_there_are_named(run: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such folder; give the folder of the original photos"):
         wildgs.render(run, tmp_path / "frames", over="day", photos=tmp_path / "nowhere")
-    with pytest.raises(UserError, match="--photos tells the hours"):
+    with pytest.raises(UserError, match="--photos is only used with --over day"):
         wildgs.render(run, tmp_path / "frames", photos=tmp_path)
 
 
@@ -144,12 +144,12 @@ def test_over_day_takes_no_other_light(run: Path, tmp_path: Path, capsys: pytest
     with pytest.raises(SystemExit) as ended:
         main(["render", str(run), "--over", "day", "--to", "a.jpg", "--output", str(tmp_path / "a")])
     assert ended.value.code == 2
-    assert "--over takes its light from all photos" in capsys.readouterr().err
+    assert "--over uses the light of all photos" in capsys.readouterr().err
 
 
 def test_a_run_with_one_light_has_no_day(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = wildgs.load(run)
     monkeypatch.setattr(type(scene), "relightable", property(lambda _: False))
     (run / DAY_FILE).unlink(missing_ok=True)
-    with pytest.raises(UserError, match="a day needs a run whose light changes"):
+    with pytest.raises(UserError, match="needs a run that can be relit"):
         find_day(scene)

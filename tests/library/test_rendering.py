@@ -27,7 +27,7 @@ def test_one_still_goes_into_a_file(name: str, trained: Path, tmp_path: Path) ->
         assert (done.pictures, done.size) == (1, picture.size)
         assert picture.format == {"still.png": "PNG", "still.jpg": "JPEG"}[name]
     scene = wildgs.load(trained)
-    with pytest.raises(UserError, match="holds one picture"):
+    with pytest.raises(UserError, match="is one image"):
         wildgs.render(scene, tmp_path / name, views=[view.name for view in scene.views[:2]])
 
 

@@ -66,7 +66,7 @@ def test_sharing_needs_the_flag(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_relay_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_, **__: None)
-    with pytest.raises(UserError, match="no public address"):
+    with pytest.raises(UserError, match="not provide a public URL"):
         open_server(ServerConfig(port=0, share=True), "title")
 
 

@@ -123,7 +123,7 @@ def _run(command: Command) -> None:
     if done.failures:
         title, reason = next(iter(done.failures.items()))
         raise UserError(
-            f"{len(done.failures)} of {done.runs} runs failed, first {title} ({reason}); run the same command again to "
+            f"{len(done.failures)} of {done.runs} runs failed, first {title} ({reason}); repeat the command to "
             "retry them"
         )
 

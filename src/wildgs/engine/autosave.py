@@ -1,4 +1,4 @@
-"""Checkpoints during training: when one is due, who writes it, and what happens where the disk is full."""
+"""Checkpoints during training: periodic saving, writing in the background, retries when the disk is full."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from wildgs.errors import UserError, WildGSWarning
 
 
 class CheckpointWriter:
-    """Writes checkpoints, if `background` by a thread: training then waits only for the copy to main memory.
+    """Writes checkpoints, with `background` in a thread, so that training only waits for the copy to the CPU.
 
-    On the CPU the thread would take a core from training.
+    When training on the CPU, the thread would take a core from it.
     """
 
     def __init__(self, background: bool) -> None:
@@ -30,10 +30,10 @@ class CheckpointWriter:
         self._copies: dict[str, Tensor] = {}
 
     def save(self, folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> None:
-        """Writes a checkpoint as `save_checkpoint` does, once the one before is written.
+        """Writes a checkpoint by `save_checkpoint` after the previous one is finished.
 
         Raises:
-            UserError: This checkpoint, or in the background the one before it, could not be written.
+            UserError: This checkpoint or, in the background, the previous one could not be written.
         """
         if self._thread is None or not self.background:
             save_checkpoint(folder, step, state, header)
@@ -42,13 +42,13 @@ class CheckpointWriter:
         self._pending = self._thread.submit(save_checkpoint, folder, step, self._copied(state), header)
 
     def wait(self) -> None:
-        """Waits for the checkpoint that is being written; raises its `UserError` if it could not be."""
+        """Waits for the checkpoint being written; raises its `UserError` if that fails."""
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
 
     def finish(self) -> bool:
-        """Waits, and writes later checkpoints synchronously; returns whether the last one was written."""
+        """Waits, and writes further checkpoints synchronously; returns whether the last one was written."""
         self.background = False
         try:
             self.wait()
@@ -57,7 +57,7 @@ class CheckpointWriter:
         return True
 
     def _copied(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The state in main memory; page-locked for tensors on a GPU, and kept for the next checkpoint."""
+        """Copies the state to the CPU, from a GPU into pinned buffers that are reused for the next checkpoint."""
         on_cuda = any(value.is_cuda for value in state.values())
         kept: dict[str, Tensor] = {}
         for name, value in state.items():
@@ -73,13 +73,14 @@ class CheckpointWriter:
 
 RETRY_SECONDS = 60.0
 LAST_TRIES, LAST_WAIT = 6, 10.0
-"""Attempts to write the last checkpoint, and seconds between them."""
+"""Number of attempts to write the last checkpoint, and seconds between them."""
 
 
 class Autosave:
-    """An observer of training that saves checkpoints when they are due.
+    """An observer of training that saves checkpoints periodically.
 
-    Not after a step that was skipped for a non-finite loss or gradient: its cause may be in the parameters.
+    Nothing is saved after a step that was skipped for a non-finite loss or gradient, since parameters may be the
+    cause.
     """
 
     def __init__(
@@ -92,15 +93,15 @@ class Autosave:
         rescue: Callable[[], Path] | None = None,
         least_seconds: float = 0.0,
     ) -> None:
-        """Sets when and how to save.
+        """Creates the observer.
 
         Args:
-            save: Writes a checkpoint of the trainer's present state; raises `UserError` where it cannot.
+            save: Writes a checkpoint of the trainer's current state; raises `UserError` on failure.
             every: Steps between checkpoints.
-            minutes: Minutes between checkpoints; whichever comes first.
+            minutes: Largest time between checkpoints, in minutes.
             step: The step of the newest checkpoint.
-            rescue: Writes the state to another place, if the last checkpoint cannot be written to its own.
-            least_seconds: Least time between two checkpoints.
+            rescue: Writes the state to another folder if the last checkpoint cannot be written to the run folder.
+            least_seconds: Smallest time between checkpoints.
         """
         self._save, self._rescue = save, rescue
         self.every, self.minutes = every, minutes
@@ -113,9 +114,9 @@ class Autosave:
         return time.monotonic() + 60 * self.minutes
 
     def __call__(self, report: StepReport) -> None:
-        """Saves if it is time to; if that fails, warns and tries again a minute later."""
-        rested = time.monotonic() - self._saved_at >= self._least_seconds
-        on_step = rested and report.falls_on(self.every)
+        """Saves if a checkpoint is due; if that fails, warns and tries again a minute later."""
+        old_enough = time.monotonic() - self._saved_at >= self._least_seconds
+        on_step = old_enough and report.falls_on(self.every)
         if report.skipped is not None or not (on_step or time.monotonic() >= self._due):
             return
         try:
@@ -125,10 +126,10 @@ class Autosave:
             warnings.warn(f"{error} (training continues and tries again)", WildGSWarning, stacklevel=2)
 
     def save(self, step: int) -> None:
-        """Saves now, unless this step is saved already.
+        """Saves now, unless this step is already saved.
 
         Raises:
-            UserError: It cannot be written.
+            UserError: The checkpoint cannot be written.
         """
         if step > self.saved_step:
             self._save()
@@ -137,10 +138,10 @@ class Autosave:
             self._due = self._next_time()
 
     def save_last(self, step: int, *, hurry: bool = False) -> None:
-        """Saves the last step: tries for a minute, or once where there is a hurry, then writes it to another place.
+        """Saves the last step: tries for a minute, or once in a `hurry`, then writes it to another folder.
 
         Raises:
-            UserError: It could not be written to the run folder; the message says where the state is.
+            UserError: It could not be written to the run folder; the message names the other folder.
         """
         left = 0 if hurry else LAST_TRIES - 1
         while True:
@@ -161,6 +162,6 @@ class Autosave:
         except UserError:
             raise failure from None
         raise UserError(
-            f"{failure}; the state of step {step} was saved as {place} instead: free disk space, move it into the "
-            "run's checkpoints folder, then --resume"
+            f"{failure}; step {step} was saved as {place} instead: free disk space, move this file into the run's "
+            "checkpoints folder, then --resume"
         ) from failure

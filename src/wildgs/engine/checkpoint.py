@@ -23,12 +23,12 @@ KEPT = 2
 DAMAGED = ".damaged"
 _NAME = re.compile(r"step_(\d{8})\.safetensors")
 _TIMINGS = ("progress.seconds",)
-"""Tensors that differ between two equal runs."""
+"""Tensors that differ between otherwise identical runs."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was read: what `Trainer.state` gave, and the caller's header of JSON values."""
+    """A loaded checkpoint: the result of `Trainer.state`, and a header of JSON values."""
 
     state: dict[str, Tensor]
     header: dict[str, Any]
@@ -41,21 +41,21 @@ class Checkpoint:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of all tensors but timings: the same for runs that computed the same."""
+        """SHA-256 of all tensors except timings, for comparing runs."""
         return _digest({k: v for k, v in self.state.items() if k not in _TIMINGS}, "")
 
 
 class DamagedCheckpointError(UserError):
-    """A checkpoint whose content is not what was written: truncated, or changed on the disk."""
+    """A checkpoint is truncated or its content has changed."""
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: dict[str, Any]) -> Path:
-    """Writes ``step_NNNNNNNN.safetensors`` atomically and flushed to the disk; the last two are kept.
+    """Writes ``step_NNNNNNNN.safetensors`` atomically, flushes it to the disk and deletes all but the last two.
 
-    A failure leaves the earlier checkpoints as they were. The header holds JSON values.
+    A failure does not affect earlier checkpoints. The header holds JSON values.
 
     Raises:
-        UserError: The disk is full, or the folder cannot be written to.
+        UserError: The file cannot be written.
     """
     path = folder / f"step_{step:08d}.safetensors"
     tensors = {name: value.detach().cpu().contiguous() for name, value in state.items()}
@@ -66,7 +66,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Tensor], header: d
         with written_aside(path, flush=True) as aside:
             try:
                 save_file(tensors, aside, metadata=metadata)
-            except SafetensorError as error:  # so it reports a full disk
+            except SafetensorError as error:  # raised on a full disk
                 raise OSError(error) from error
         for old in list_checkpoints(folder)[:-KEPT]:
             old.unlink()
@@ -96,19 +96,19 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Reads a checkpoint and compares its checksum.
+    """Reads a checkpoint and verifies its checksum.
 
     Raises:
-        DamagedCheckpointError: Its content is not what was written.
+        DamagedCheckpointError: The file is damaged.
         UserError: The file is missing, or cannot be read for another reason (permissions, memory).
     """
     try:
         check_regular(path)
-        with path.open("rb"):  # tells a missing permission from damage
+        with path.open("rb"):  # raises OSError if permissions are missing
             pass
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            # Copies, since tensors in the file lie at any address, and sums depend on alignment to the last bit.
+            # Cloned for memory alignment, on which the last bit of sums depends.
             state = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a dict
         return Checkpoint(state, _checked_header(metadata, state))
     except (_DamageError, SafetensorError) as error:
@@ -116,7 +116,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             raise UserError(f"{path} cannot be read ({error}); {_NOT_DAMAGED}") from error
         raise DamagedCheckpointError(f"{path} is damaged ({error}); use another checkpoint") from error
     except (OSError, MemoryError, RuntimeError) as error:  # torch reports missing memory as a RuntimeError
-        if getattr(error, "errno", None) == errno.ELOOP:  # a link to itself has no content to wait for
+        if getattr(error, "errno", None) == errno.ELOOP:
             raise DamagedCheckpointError(f"{path} is a link to itself; use another checkpoint") from error
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(f"{path} cannot be read ({reason}); {_NOT_DAMAGED}") from error
@@ -133,15 +133,15 @@ def load_header(path: Path) -> dict[str, Any]:
     return header if isinstance(header, dict) else {}
 
 
-_NOT_DAMAGED = "the file stays as it is: free memory or fix permissions, then try again"
+_NOT_DAMAGED = "the file was not changed: free memory or fix permissions, then try again"
 
 
 class _DamageError(Exception):
-    """Why a checkpoint's content cannot be used."""
+    """A checkpoint's header or checksum is invalid."""
 
 
 def _checked_header(metadata: dict[str, str], state: dict[str, Tensor]) -> dict[str, Any]:
-    """The header of a checkpoint whose checksum fits."""
+    """The header of a checkpoint, after verifying its checksum."""
     try:
         text, checksum = metadata["wildgs"], metadata["sha256"]
         header = json.loads(text)
@@ -155,10 +155,10 @@ def _checked_header(metadata: dict[str, str], state: dict[str, Tensor]) -> dict[
 
 
 def load_newest(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
-    """The newest undamaged checkpoint, or None where there is no checkpoint at all.
+    """Loads the newest undamaged checkpoint; None if there are no checkpoints.
 
-    A warning names damaged ones, and the one before is read. With `set_aside` they are renamed, so that they do
-    not count among the two that are kept.
+    Warns of damaged ones and loads the previous one instead. With `set_aside`, damaged files are renamed, so that
+    they do not count as one of the two that are kept.
 
     Raises:
         UserError: All checkpoints are damaged, or the newest cannot be read for another reason.

@@ -1,7 +1,8 @@
 """Training on several processes (ranks): `torchrun --nproc-per-node K -m wildgs train ...`.
 
-Every rank holds the whole model and trains on another photo. Gradients and screen statistics are summed over the
-ranks, and whatever decides is the same on all of them, so that they stay identical to the bit (docs/scaling.md).
+Data parallelism: every rank holds the whole model and trains on a different photo. Gradients and view statistics
+are summed over the ranks and all decisions are the same everywhere, so that the models stay bitwise identical
+(docs/scaling.md).
 """
 
 from __future__ import annotations
@@ -27,18 +28,19 @@ from wildgs.losses.objective import Losses
 from wildgs.threads import thread_count
 
 BUCKET_ELEMENTS = 1 << 22
-"""Smaller tensors are sent in buckets of at most about twice so many numbers: 16 MB saturate any network, and one
-message for each of a network's hundreds of small tensors would be bound by latency."""
+"""Smaller tensors are sent in buckets of this to twice this number of elements (16 MB or more), since one message
+per small tensor would be bound by latency."""
 
 
 @torch.no_grad()
 def sum_over_ranks(tensors: Sequence[Tensor]) -> None:
-    """Replaces every tensor by its sum over all ranks; afterwards all ranks hold the same bits.
+    """Replaces every tensor by its sum over all ranks, which is bitwise identical on all ranks.
 
-    Large tensors are sent as they are, small ones in flat buckets, all asynchronously.
+    Large tensors are sent separately, small ones in flat buckets, all asynchronously.
 
     Args:
-        tensors: Of the same shapes in the same order on all ranks, in any memory layout; one dtype and device.
+        tensors: Tensors with the same shapes in the same order on all ranks, in any memory layout; one dtype and
+            device.
     """
     small = [tensor for tensor in tensors if tensor.numel() < BUCKET_ELEMENTS]
     sent: list[tuple[list[Tensor], Tensor]] = []
@@ -71,15 +73,15 @@ def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
 
 
 def raise_once(messages: Sequence[str | None], rank: int, own: UserError | None = None) -> None:
-    """Ends all ranks if one of them failed, and reports the error once.
+    """Stops all ranks if one of them failed, and reports the error once.
 
     Args:
-        messages: The message of each rank's error, None for ranks without.
-        rank: Of this process.
+        messages: The message of each rank's error; None for ranks without an error.
+        rank: Rank of this process.
         own: The error of this rank.
 
     Raises:
-        UserError: On rank 0: its own error, or the first other one with its rank.
+        UserError: On rank 0: its own error, or that of the first failed rank.
         ReportedError: On the other ranks.
     """
     failed = [other for other, message in enumerate(messages) if message is not None]
@@ -94,17 +96,18 @@ def raise_once(messages: Sequence[str | None], rank: int, own: UserError | None 
 Result = TypeVar("Result")
 
 TIMEOUT = timedelta(minutes=10)
-"""How long a rank waits for one that does not answer while its connection is open: the first use of the CPU kernels
-compiles for minutes, and so does a checkpoint on a slow disk take."""
+"""Timeout of communication. Compiling the CPU kernels and writing a checkpoint to a slow disk may take minutes."""
 
 
 class Ranks(Team):
-    """One of several processes; `join` makes it."""
+    """One of several processes; created by `join`."""
 
     def __init__(self, control: dist.ProcessGroup) -> None:
-        """Takes a gloo group of all ranks for messages between hosts.
+        """Creates the team.
 
-        It reports a lost rank at once, where a GPU's collectives would wait for their timeout.
+        Args:
+            control: A gloo group of all ranks for control messages. It detects a lost rank at once, while NCCL
+                would wait for its timeout.
         """
         super().__init__()
         self.rank = dist.get_rank()
@@ -114,7 +117,7 @@ class Ranks(Team):
 
     @property
     def stop_signal(self) -> int:
-        """The highest signal that any rank had received before the last step."""
+        """The highest signal number that any rank received before the last step."""
         return self._stop_signal
 
     @contextmanager
@@ -172,7 +175,7 @@ class Ranks(Team):
         return Losses(image=image, mask=mask, depth=depth, total=total)
 
     def _exchange_control(self, parameters: list[Tensor]) -> None:
-        """One small message ahead of the gradients: who has which, whether sizes agree and to stop."""
+        """Exchanges, before the gradients, which of them exist, the size of the model, and a signal to stop."""
         count = sum(parameter.numel() for parameter in parameters)
         present = [int(parameter.grad is not None) for parameter in parameters]
         state = torch.tensor([self.received_signal, count, -count, *present])
@@ -181,8 +184,8 @@ class Ranks(Team):
         self._stop_signal, most, least, *present = state.tolist()
         if most != -least:
             message = (
-                f"the ranks' models differ in size ({-least:,} and {most:,} numbers); --resume continues from the "
-                "newest checkpoint, which all ranks take from rank 0"
+                f"the ranks' models differ in size ({-least:,} and {most:,} elements); --resume continues from the "
+                "newest checkpoint"
             )
             raise DivergedRanksError(message) if self.first else ReportedError(message)
         for parameter, somewhere in zip(parameters, present, strict=True):
@@ -206,7 +209,7 @@ class Ranks(Team):
 
 @contextmanager
 def _peers() -> Iterator[None]:
-    """Turns a broken connection into `LostRankError` on the first rank that notices, `ReportedError` on others."""
+    """Converts connection errors to `LostRankError` on the rank that notices first, else `ReportedError`."""
     try:
         yield
     except torch.OutOfMemoryError:
@@ -214,15 +217,15 @@ def _peers() -> Iterator[None]:
     except RuntimeError as error:
         reason = (str(error).splitlines() or [""])[0]
         message = (
-            "another process of this training ended or does not answer, so all of them stop (torchrun says below "
-            "which one failed first); the same command with --resume continues from the newest checkpoint, with "
-            f"any number of processes. The connection said: {reason}"
+            "another process of this training ended or does not answer, so all of them stop (torchrun reports "
+            "below which one failed first); run the same command with --resume to continue from the newest "
+            f"checkpoint with any number of processes. Cause: {reason}"
         )
         raise (LostRankError(message) if _notices_first() else ReportedError(message)) from error
 
 
 def _notices_first() -> bool:
-    """By a counter in torchrun's store, which outlives all ranks."""
+    """Whether this is the first rank to notice, by a counter in torchrun's store, which outlives the ranks."""
     try:
         return dist.distributed_c10d._get_default_store().add("wildgs/lost", 1) == 1
     except RuntimeError:
@@ -231,15 +234,15 @@ def _notices_first() -> bool:
 
 @contextmanager
 def join() -> Iterator[Team]:
-    """Connects the processes that torchrun started; without torchrun, a team of one.
+    """Connects the processes that torchrun started; without torchrun, gives a team of one process.
 
     Raises:
-        UserError: There are more processes than GPUs, or no connection.
+        UserError: There are more processes than GPUs, or they cannot connect.
     """
     if processes.world_size() == 1:
         yield Team()
         return
-    # A library's handler would print a page of stack where torchrun ends those that are left.
+    # Replaces pycolmap's handler, which would print a stack trace when torchrun stops the remaining processes.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     device = assign_device()
     try:
@@ -250,7 +253,7 @@ def join() -> Iterator[Team]:
         control = dist.new_group(backend="gloo", timeout=TIMEOUT)
     except (RuntimeError, ValueError) as error:
         reason = (str(error).splitlines() or [""])[0]
-        raise UserError(f"the processes find no connection to each other: {reason}") from error
+        raise UserError(f"the processes cannot connect to each other: {reason}") from error
     assert isinstance(control, dist.ProcessGroup)
     agreed = False
     try:
@@ -260,14 +263,14 @@ def join() -> Iterator[Team]:
         agreed = True
         raise
     finally:
-        # After an error nccl would wait for ranks that are gone.
+        # After an error NCCL would wait for lost ranks.
         if agreed or device.type == "cpu":
             with contextlib.suppress(RuntimeError):
                 dist.destroy_process_group()
 
 
 def assign_device() -> torch.device:
-    """Assigns this process its own GPU, or its share of the machine's cores.
+    """Assigns this process its own GPU, and its share of the machine's cores.
 
     Raises:
         UserError: There are more processes than GPUs.
@@ -287,9 +290,9 @@ def assign_device() -> torch.device:
 
 
 def _share_cores() -> None:
-    """Divides a machine's cores among its processes, where torchrun put all of them on one core each."""
+    """Divides a machine's cores among its processes; torchrun limits each to one core by default."""
     if os.environ.get("OMP_NUM_THREADS", "1") != "1":
-        return  # the user's choice
+        return  # set by the user
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = max(1, cores // processes.local_world_size())
     torch.set_num_threads(thread_count() if "WILDGS_NUM_THREADS" in os.environ else share)

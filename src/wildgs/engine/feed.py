@@ -1,4 +1,4 @@
-"""What a step trains on: photos in shuffled rounds, and what belongs to each, on the device."""
+"""Input of training: photos in shuffled epochs, with their masks, depth maps and cameras on the device."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wildgs.scene.image_cache import AHEAD
 
 
 class ViewSampler:
-    """Endless shuffled rounds over `count` views, with a state that can be saved."""
+    """Endless shuffled epochs over `count` views, with a state that can be saved."""
 
     def __init__(self, count: int, generator: torch.Generator) -> None:
         self.count = count
@@ -31,13 +31,13 @@ class ViewSampler:
         return self.take(1)[0]
 
     def take(self, count: int) -> list[int]:
-        """Indices of the next `count` views, all different; at most as many as there are views."""
+        """Indices of the next `count` views, all different; `count` is at most the number of views."""
         taken = self.upcoming(count)
         self.position += len(taken)
         missing = count - len(taken)
         if missing:
             order = torch.randperm(self.count, generator=self._generator)
-            if taken:  # a round may not begin with the photos that end the one before, in the same step
+            if taken:  # an epoch must not start with photos of the previous one that are in the same step
                 repeated = torch.isin(order, torch.tensor(taken))
                 fresh = order[~repeated]
                 order = torch.cat([fresh[:missing], order[repeated], fresh[missing:]])
@@ -47,15 +47,15 @@ class ViewSampler:
         return taken
 
     def upcoming(self, count: int) -> list[int]:
-        """Indices of the next views, as far as this round has been drawn."""
+        """Indices of the next views, as far as this epoch is shuffled."""
         return self.order[self.position : self.position + count].tolist()
 
     def state(self) -> dict[str, Tensor]:
-        """What `restore` needs."""
+        """The state for `restore`."""
         return {"order": self.order.clone(), "position": torch.tensor(self.position)}
 
     def restore(self, state: dict[str, Tensor]) -> bool:
-        """Continues from `state`; whether in the same order, since another number of photos is shuffled again."""
+        """Continues from `state`; False if the number of photos has changed, so that they are shuffled again."""
         same = len(state["order"]) in (0, self.count)
         self.order = state["order"] if same else torch.empty(0, dtype=torch.int64)
         self.position = int(state["position"]) if same else 0
@@ -87,21 +87,21 @@ class PhotoFeed:
         self._cameras: dict[str, Camera] = {}
 
     def next_view(self) -> View:
-        """The next photo that can be read, while those after it are decoded in the background.
+        """The next readable photo; starts decoding the following ones in the background.
 
         Raises:
-            UserError: None can be read any more.
+            UserError: No photo can be read.
         """
         for index in self._candidates():
             view = self.views[index]
             if self.is_readable(view):
                 return view
         raise UserError(
-            f"no photo can be read any more: {', '.join(sorted(self._unreadable)[:3])}; put them back"
+            f"the photos cannot be read any more ({', '.join(sorted(self._unreadable)[:3])}); restore them"
         )
 
     def _candidates(self) -> Iterator[int]:
-        """This rank's next photo, then replacements for it; the sampler advances equally on all ranks."""
+        """This rank's next photo, then its replacements; the sampler advances equally on all ranks."""
         size, rank = self.team.size, self.team.rank
         for _ in range(len(self.views)):
             batch = self.sampler.take(size)
@@ -115,7 +115,7 @@ class PhotoFeed:
                 return
 
     def is_readable(self, view: View) -> bool:
-        """Whether a photo can still be read; warns once where it cannot."""
+        """Whether a photo can still be read; warns once if not."""
         try:
             view.read_photo()
         except UserError as error:
@@ -126,25 +126,25 @@ class PhotoFeed:
         return True
 
     def photo(self, view: View) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
-        """The photo and which of its pixels count, see `View.load`."""
+        """The photo and its valid pixels, see `View.load`."""
         return view.load(self.device)
 
     def disparity(self, view: View) -> Float[Tensor, "H W"] | None:
-        """The depth prior, where there is one."""
+        """The disparity map of the photo, if there is one."""
         disparity = view.read_disparity()
         return None if disparity is None else upload(disparity, self.device)
 
     def depth(self, view: View) -> Float[Tensor, "H W"] | None:
-        """The metric depth, where there is any."""
+        """The metric depth map of the photo, if there is one."""
         depth = view.read_depth()
         return None if depth is None else upload(depth, self.device)
 
     def observations(self, view: View) -> Float[Tensor, "K 2"] | None:
-        """Pixels (x, y) at which the photo shows triangulated points, where that is known."""
+        """Pixels (x, y) of the photo's triangulated points, if known."""
         return self._observations.get(view.name)
 
     def camera(self, view: View) -> Camera:
-        """The camera, carried to the device once."""
+        """The camera, cached on the device."""
         if view.name not in self._cameras:
             self._cameras[view.name] = view.camera.to(self.device)
         return self._cameras[view.name]

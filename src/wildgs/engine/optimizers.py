@@ -1,4 +1,4 @@
-"""Adam for Gaussians and networks, and row edits that keep its state aligned with the Gaussians."""
+"""Adam for Gaussians and networks; adding, removing and sorting Gaussians together with Adam's moments."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from wildgs.model.method import Method
 
 
 def geometry_rates(config: OptimizerConfig, extent: float, steps: int) -> dict[str, LearningRate]:
-    """Learning rates of the rows that every method has.
+    """Learning rates of the geometry, which every method has.
 
     Args:
-        config: The rates.
-        extent: Scales positions.
-        steps: Length of the run.
+        config: The configured learning rates.
+        extent: Scene extent, by which that of positions is scaled.
+        steps: Number of training steps.
     """
     factor = max(1.0, REFERENCE_STEPS / steps) ** config.short_runs
     return {
@@ -37,15 +37,15 @@ def geometry_rates(config: OptimizerConfig, extent: float, steps: int) -> dict[s
 
 @dataclass
 class Optimizers:
-    """Adam over the per-Gaussian rows (one group a row) and over the networks.
+    """Adam for the per-Gaussian parameters (one group per entry of `Gaussians.rows`) and for the networks.
 
     Attributes:
-        config: Of the geometry.
-        row_rates: Learning rate of every row.
-        network_rates: Learning rate of every other group, by its name.
-        rows: For `Gaussians.rows`; eps 1e-15 as 3DGS.
-        networks: For everything else, or None where a method has nothing else.
-        photos: Photos in the mean gradient of one step.
+        config: Learning rates of the geometry.
+        row_rates: Learning rate of every per-Gaussian parameter.
+        network_rates: Learning rate of every other group, by name.
+        rows: Optimiser of `Gaussians.rows`, with eps = 1e-15 as in 3DGS.
+        networks: Optimiser of all other parameters; None if a method has none.
+        photos: Number of photos over which the gradient of a step is averaged.
     """
 
     config: OptimizerConfig
@@ -64,14 +64,14 @@ class Optimizers:
         photos: int = 1,
         steps: int = REFERENCE_STEPS,
     ) -> Optimizers:
-        """Optimisers for a method.
+        """Creates the optimisers of a method.
 
         Args:
             method: The method.
             config: Learning rates of the geometry.
-            extent: Radius of the cameras' region, world units (3DGS's spatial learning rate scale).
-            photos: Photos in the mean gradient of one step.
-            steps: Length of the run.
+            extent: Scene extent: radius of the camera positions, in units of the aligned frame.
+            photos: Number of photos over which the gradient of a step is averaged.
+            steps: Number of training steps.
         """
         scaled = photos if config.batch_scaling == "sqrt" else 1
         rate, betas = scaled**0.5, (0.9**scaled, 0.999**scaled)
@@ -98,17 +98,17 @@ class Optimizers:
         return self.photos**0.5 if self.config.batch_scaling == "sqrt" else 1.0
 
     def set_progress(self, progress: float) -> None:
-        """Sets every learning rate for a share of the run in [0, 1]."""
+        """Sets all learning rates for a fraction of the run, 0 to 1."""
         for optimizer, rates in ((self.rows, self.row_rates), (self.networks, self.network_rates)):
             for group in [] if optimizer is None else optimizer.param_groups:
                 chosen = rates[group["name"]]
                 group["lr"] = chosen.start * (self.rate * exponential(1.0, chosen.decay, progress))
 
     def step(self, faulty: Float[Tensor, ""] | None = None) -> None:
-        """One Adam step everywhere, then clears the gradients.
+        """Takes one Adam step and clears the gradients.
 
         Args:
-            faulty: Not 0 where the step is not to be taken; read on its device, so that the host need not wait.
+            faulty: Nonzero to skip the step; evaluated on the device, without synchronisation.
         """
         for optimizer in (self.rows, self.networks):
             if optimizer is not None:
@@ -117,9 +117,9 @@ class Optimizers:
                 optimizer.zero_grad(set_to_none=True)
 
     def state(self) -> dict[str, Tensor]:
-        """Adam's moments and step counts, as flat tensors.
+        """Adam's moments and step counts by name.
 
-        Steps are counted in photos, so that training may continue with another number of photos a step.
+        Steps are counted in photos, so that training can continue with another number of photos per step.
         """
         return {
             f"{kind}.{index}.{key}": value * self.photos if key == "step" else value
@@ -128,7 +128,7 @@ class Optimizers:
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Puts back what `state` gave, for the same method with the same rows."""
+        """Restores the result of `state` for the same method with the same Gaussians."""
         for kind, index, parameter, optimizer in self._parameters():
             prefix = f"{kind}.{index}."
             found = {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
@@ -147,7 +147,7 @@ class Optimizers:
 
 
 def _laid_out_as(parameter: Tensor, value: Tensor) -> Tensor:
-    """A moment in its parameter's memory layout: fused Adam walks both as they lie."""
+    """Copies a moment into its parameter's memory layout, as fused Adam requires."""
     if value.shape != parameter.shape:
         return value.to(parameter.device)
     return torch.empty_like(parameter, requires_grad=False).copy_(value)
@@ -162,17 +162,17 @@ def edit_rows(
     *,
     sort: bool = False,
 ) -> Int[Tensor, " M"]:
-    """Drops and adds Gaussians, in parameters and optimiser state alike.
+    """Removes and adds Gaussians, in parameters and optimiser state.
 
     Args:
         gaussians: Edited in place.
-        optimizer: Holds one group a row, named after it.
-        keep: Which present Gaussians stay, in their order.
-        added: New Gaussians' rows, one tensor for every row name; they start with empty Adam moments.
-        sort: Whether to put all of them in Morton order, see `sort_rows`; else the new ones come last.
+        optimizer: Optimiser with one group per entry of `gaussians.rows`.
+        keep: Gaussians to keep.
+        added: Parameters of the new Gaussians; their Adam moments are zero.
+        sort: Whether to sort all Gaussians in Morton order (`sort_rows`); else the new ones are appended.
 
     Returns:
-        Which of the former Gaussians each is; -1 for new ones.
+        For each Gaussian its previous index; -1 for new ones.
     """
     kept = keep.nonzero()[:, 0]
     count, new = len(kept), len(added["means"])
@@ -201,12 +201,12 @@ def edit_rows(
 
 @torch.no_grad()
 def sort_rows(gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> Int[Tensor, " N"]:
-    """Puts Gaussians that are near in space near in memory, in parameters and optimiser state alike.
+    """Sorts Gaussians in Morton order, in parameters and optimiser state.
 
-    What samples the triplane and scatters back to it then finds its neighbours' cells in the cache.
+    Neighbouring Gaussians then access the same triplane cells, which improves cache use of sampling and scattering.
 
     Returns:
-        Which of the former Gaussians each is.
+        For each Gaussian its previous index.
     """
     order = morton_order(gaussians.means)
     _change_rows(gaussians, optimizer, lambda _, values, moments: values[order])
@@ -216,7 +216,7 @@ def sort_rows(gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> Int[Ten
 def _change_rows(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, change: Callable[[str, Tensor, bool], Tensor]
 ) -> None:
-    """Replaces every row's parameter and its moments by what `change(name, values, moments)` makes of them."""
+    """Replaces every parameter and its moments by the result of `change(name, values, moments)`."""
     for group in optimizer.param_groups:
         name = group["name"]
         old = gaussians.rows[name]
@@ -233,7 +233,7 @@ def _change_rows(
 
 @torch.no_grad()
 def reset_moments(optimizer: torch.optim.Optimizer, gaussians: Gaussians, name: str) -> None:
-    """Clears the Adam moments of one row (after its values were overwritten)."""
+    """Clears the Adam moments of one parameter (after its values were overwritten)."""
     state = optimizer.state.get(gaussians.rows[name], {})
     for key in ("exp_avg", "exp_avg_sq"):
         if key in state:

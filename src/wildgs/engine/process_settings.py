@@ -1,4 +1,4 @@
-"""Process-wide settings that training changes while it runs, and puts back."""
+"""Process-wide settings that training changes and restores."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 from wildgs.processes import library_environment
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
-_MMAP_BYTES, _KEPT_BYTES = 2**25, 2**30  # glibc takes no more than 32 MiB for the first
-_DEFAULT_BYTES = 128 * 2**10  # of both
+_MMAP_BYTES, _KEPT_BYTES = 2**25, 2**30  # 32 MiB is glibc's maximum of the first
+_DEFAULT_BYTES = 128 * 2**10
 
 
 class ProcessSettings:
-    """Settings of the process and states of torch's random generators, in effect between `begin` and `end`.
+    """Settings of the process and states of torch's random generators between `begin` and `end`.
 
-    The generators' states are taken when this is created, so that a seed set before also holds for training.
+    The generators' states are copied at construction, so that a seed set before applies to training.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -28,7 +28,7 @@ class ProcessSettings:
         self._undo: ExitStack | None = None
 
     def begin(self) -> None:
-        """Applies the training's settings, unless they are applied already."""
+        """Applies the settings of training if they are not applied yet."""
         if self._undo is not None:
             return
         undo = ExitStack()
@@ -36,7 +36,7 @@ class ProcessSettings:
         undo.callback(_set_random_states, self.device, _random_states(self.device))
         _set_random_states(self.device, self._random)
         if self.device.type == "cpu":
-            # Adam's moments of what gets no gradient decay into denormals, which cost up to 100 times as much.
+            # Adam's moments of parameters without gradients decay into denormals, which are up to 100 times slower.
             undo.callback(torch.set_flush_denormal, _flushes_denormals())
             torch.set_flush_denormal(True)
             _keep_freed_memory(True)
@@ -44,18 +44,18 @@ class ProcessSettings:
         self._undo = undo
 
     def end(self) -> None:
-        """Restores what was set before `begin`."""
+        """Restores the settings before `begin`."""
         if self._undo is not None:
             self._random = _random_states(self.device)
             self._undo.close()
             self._undo = None
 
     def random_states(self) -> dict[str, Tensor]:
-        """States of the training's generators: `torch`, and on CUDA `cuda`."""
+        """States of the random generators of training: `torch`, and on CUDA `cuda`."""
         return self._random if self._undo is None else _random_states(self.device)
 
     def set_random_states(self, states: dict[str, Tensor]) -> None:
-        """Continues from the states that `random_states` gave, possibly on another device."""
+        """Restores the result of `random_states`, possibly on another device."""
         self._random = self._random | {name: states[name] for name in self._random if name in states}
         if self._undo is not None:
             _set_random_states(self.device, self._random)

@@ -1,4 +1,4 @@
-"""Records of a training: metrics.jsonl and TensorBoard."""
+"""Logs of training: metrics.jsonl and TensorBoard."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from wildgs.files import check_regular, is_there, printable, written_aside
 
 
 class Recorder:
-    """An observer of training; a context manager that closes its files."""
+    """An observer of training that writes logs; a context manager that closes its files."""
 
     def __init__(
         self, folder: Path, *, scalars_every: int = 50, pictures_every: int = 500, step: int = 0
     ) -> None:
-        """Opens the records in a run folder.
+        """Opens the logs in a run folder.
 
         Args:
             folder: The run folder.
             scalars_every: Steps between log entries.
-            pictures_every: Steps between pictures on TensorBoard.
-            step: Steps done; later records of an earlier process are dropped.
+            pictures_every: Steps between images on TensorBoard.
+            step: Number of steps done; log entries of later steps are dropped.
 
         Raises:
             UserError: The folder cannot be written to.
@@ -39,8 +39,8 @@ class Recorder:
         lines = folder / "metrics.jsonl"
         if printable(str(folder)) != str(folder):
             raise UserError(
-                f"{printable(str(folder))}: TensorBoard cannot write to paths that are not UTF-8 or hold control"
-                " characters; choose another --output"
+                f"{printable(str(folder))}: TensorBoard cannot write to paths that are not UTF-8 or contain "
+                "control characters; choose another --output"
             )
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -65,11 +65,11 @@ class Recorder:
         trace: TracebackType | None,
     ) -> None:
         for file in (self._lines, self._board):
-            with contextlib.suppress(OSError):  # a full disk: what is lost was said already
+            with contextlib.suppress(OSError):  # a full disk has been reported already
                 file.close()
 
     def __call__(self, report: StepReport) -> None:
-        """Records a step where its turn has come; if the disk fails, training continues without records."""
+        """Logs a step if it is due; if the files cannot be written, training continues without logs."""
         try:
             if report.falls_on(self.scalars_every) or report.skipped is not None:
                 self._record_scalars(report)
@@ -111,7 +111,7 @@ class Recorder:
 
 
 def _grey(depth: Tensor) -> Tensor:
-    """Inverse depth, stretched to [0, 1]: near is bright, empty is black."""
+    """Inverse depth, scaled to [0, 1]: near is bright, empty is black."""
     disparity = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
     limit = (
         disparity[disparity > 0].quantile(0.98) if bool((disparity > 0).any()) else disparity.new_tensor(1)
@@ -120,7 +120,7 @@ def _grey(depth: Tensor) -> Tensor:
 
 
 def _keep_until(lines: Path, step: int) -> None:
-    """Drops records of steps that a resumed run repeats, and truncated lines."""
+    """Drops log entries of steps that a resumed run repeats, and truncated lines."""
     if not lines.is_file():
         return
     kept = []

@@ -1,4 +1,4 @@
-"""Skips steps with a non-finite loss or gradient, and ends a run in which they do not stop."""
+"""Skips steps with a non-finite loss or gradient, and stops a run after several in a row."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses
 
 PATIENCE = 10
-"""Bad steps in a row that end a run."""
+"""Number of consecutive skipped steps after which a run stops."""
 
 
 class TrainingDivergedError(UserError):
-    """The loss or its gradient was non-finite for `PATIENCE` steps in a row."""
+    """The loss or its gradient was non-finite in `PATIENCE` consecutive steps."""
 
 
 @dataclass(frozen=True)
 class _Mark:
-    """A step on a GPU that the host has not judged yet.
+    """A step on a GPU that the host has not checked yet.
 
     Attributes:
-        step: Its number.
-        photo: That it trained on.
-        numbers: Its losses, and 1 where it is not to be taken, on their way to main memory.
-        arrived: When they are there.
+        step: Number of the step.
+        photo: Name of its photo.
+        numbers: Its losses, and 1 if it is skipped, being copied to the CPU.
+        arrived: Event at the end of the copy.
     """
 
     step: int
@@ -39,7 +39,7 @@ class _Mark:
     arrived: torch.cuda.Event | None
 
     def read(self) -> list[float]:
-        """The numbers."""
+        """Waits for the copy and returns the numbers."""
         if self.arrived is not None:
             self.arrived.synchronize()
         return self.numbers.tolist()
@@ -49,7 +49,7 @@ class StepGuard:
     """Checks every step before the optimisers take it.
 
     Attributes:
-        in_a_row: Steps skipped since the last one taken.
+        in_a_row: Number of steps skipped since the last one taken.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class StepGuard:
 
     @property
     def skipped(self) -> int:
-        """Steps not taken so far."""
+        """Number of steps skipped so far."""
         return self._skipped + (self._mark is not None and self._mark.read()[-1] != 0)
 
     @skipped.setter
@@ -69,30 +69,30 @@ class StepGuard:
         self._mark = None
 
     def judge(self, photo: str, losses: Losses, parameters: Iterable[Tensor]) -> str | None:
-        """Whether a step may be taken; call after the backward pass. On a GPU, the host waits.
+        """Checks a step after its backward pass. Synchronises with a GPU.
 
         Args:
-            photo: Name of the photo that trains.
-            losses: Of this step.
-            parameters: With their gradients.
+            photo: Name of the photo.
+            losses: Losses of the step.
+            parameters: Parameters with gradients.
 
         Returns:
-            None for a good step, else what is not finite.
+            None if the step may be taken, else what is non-finite.
         """
         faulty = bool(_is_faulty(losses, parameters))
         return self._count(photo, faulty, losses.as_floats() if faulty else {})
 
     def mark(self, step: int, photo: str, losses: Losses, parameters: Iterable[Tensor]) -> Float[Tensor, ""]:
-        """As `judge`, but the host does not wait: `judge_marked` says the result after the next forward pass.
+        """Checks a step without synchronisation; `judge_marked` gives the result after the next forward pass.
 
         Args:
-            step: Its number.
-            photo: Name of the photo that trains.
-            losses: Of this step.
-            parameters: With their gradients.
+            step: Number of the step.
+            photo: Name of the photo.
+            losses: Losses of the step.
+            parameters: Parameters with gradients.
 
         Returns:
-            1 where the step must not be taken, else 0, for `Optimizers.step`.
+            1 if the step must be skipped, else 0, for `Optimizers.step`.
         """
         faulty = _is_faulty(losses, parameters).float()
         values = torch.stack([*losses.terms().values(), faulty])
@@ -104,7 +104,7 @@ class StepGuard:
         return faulty
 
     def judge_marked(self) -> tuple[int, str] | None:
-        """Judges the step that was marked last: its number and what is not finite; None where nothing is wrong."""
+        """The result for the last step given to `mark`: None, or its number and what is non-finite."""
         mark, self._mark = self._mark, None
         if mark is None:
             return None
@@ -120,19 +120,19 @@ class StepGuard:
         self._skipped += 1
         self.in_a_row += 1
         self._photos.append(photo)
-        wrong = [name for name, value in terms.items() if not math.isfinite(value)]
-        return f"loss term {wrong[0]}" if wrong else "gradient"
+        non_finite = [name for name, value in terms.items() if not math.isfinite(value)]
+        return f"loss term {non_finite[0]}" if non_finite else "gradient"
 
     def report(self, step: int, fault: str, method: nn.Module) -> None:
-        """Says that a step was not taken.
+        """Warns that a step was skipped.
 
         Args:
-            step: Its number.
+            step: Number of the step.
             fault: From `judge`.
-            method: Searched for parameters that are not finite, where the run has to end.
+            method: Searched for non-finite parameters if the run has to stop.
 
         Raises:
-            TrainingDivergedError: `PATIENCE` steps in a row were skipped.
+            TrainingDivergedError: `PATIENCE` consecutive steps were skipped.
         """
         photo = self._photos[-1]
         if self.in_a_row >= PATIENCE:
@@ -147,7 +147,7 @@ class StepGuard:
 
 
 def _is_faulty(losses: Losses, parameters: Iterable[Tensor]) -> Bool[Tensor, ""]:
-    """Whether the loss or a gradient is not finite, as one number: a GPU is waited for once at most."""
+    """Whether the loss or a gradient is non-finite, as one tensor: at most one synchronisation."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norm = nn.utils.get_total_norm(gradients) if gradients else losses.total.new_zeros(())
     return ~torch.isfinite(losses.total.detach() + norm.to(losses.total))
@@ -157,13 +157,13 @@ def _diagnosis(step: int, fault: str, photos: list[str], method: nn.Module) -> s
     broken = [name for name, value in method.named_parameters() if not bool(torch.isfinite(value).all())]
     names = sorted(set(photos))
     if broken:
-        cause = f"the parameters {', '.join(broken[:3])} hold non-finite values"
+        cause = f"the parameters {', '.join(broken[:3])} contain non-finite values"
     elif len(names) == 1:
-        cause = f"all of them on the photo {names[0]}; look at it and its camera, or take it out of the scene"
+        cause = f"all of them on the photo {names[0]}; check it and its camera, or remove it from the scene"
     else:
         cause = f"on {len(names)} photos ({', '.join(names[:3])}, ...), with finite parameters"
     return (
         f"training diverged at step {step}: {PATIENCE} steps in a row had a non-finite {fault}: {cause}. "
-        "The newest checkpoint was saved before; --resume continues from it, and lower learning rates "
+        "--resume continues from the newest checkpoint, which was saved before; lower learning rates "
         "(--optimizer.*) in a new run may help"
     )

@@ -1,4 +1,4 @@
-"""Training schedules as functions of the step."""
+"""Training schedule as functions of the step."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from wildgs.engine.config import ScheduleConfig
 from wildgs.model.training_pass import Stage
 
 REFERENCE_STEPS = 30_000
-"""The paper's training length; schedules below are stated for it and scale with the run's own length."""
-
+"""The paper's number of training steps, for which schedules are configured; they scale with a run's length."""
 
 _FLOORS = {
     "first_stage": 500,
@@ -17,24 +16,24 @@ _FLOORS = {
     "mask_pause": 100,
     "sh_every": 100,
 }
-"""Least steps in a short run: a mask, for example, needs so many to become useful whatever the run's length."""
+"""Smallest step counts in a short run; a mask, for example, needs this many to become useful."""
 _FLOOR_SHARE = 5
-"""A floor takes at most this part (one in five) of a run."""
+"""Such a smallest step count is at most this part (one fifth) of a run."""
 
 
 class Schedule:
-    """The schedules of one run."""
+    """The schedule of one run."""
 
     def __init__(
         self, config: ScheduleConfig, steps: int, reset_every: int = 3000, until: float = 0.5
     ) -> None:
-        """Scales a configuration in the paper's steps to a run.
+        """Scales a configuration to the length of a run.
 
         Args:
-            config: In the paper's steps.
-            steps: Length of the run.
-            reset_every: The method's, where the configuration names none.
-            until: Share of the run in which Gaussians are densified, likewise.
+            config: Configuration for 30,000 steps.
+            steps: Number of steps of the run.
+            reset_every: Steps between opacity resets unless configured; the method's default.
+            until: Fraction of the run in which Gaussians are densified unless configured; the strategy's default.
         """
         self.steps = steps
         self.encoder_every = config.encoder_every
@@ -61,44 +60,44 @@ class Schedule:
         return max(scaled, floor)
 
     def progress(self, step: int) -> float:
-        """Share of the run that lies behind, in [0, 1]."""
+        """Fraction of the run that is done, 0 to 1."""
         return min(step / max(self.steps - 1, 1), 1.0)
 
     def stage(self, step: int, sh_degree: int, taken: int = 1) -> Stage:
-        """The stage at a step (from 0) that counts for `taken` steps; `sh_degree` is the method's full degree."""
+        """The stage at a step (from 0) that counts as `taken` steps; `sh_degree` is the method's full degree."""
         return Stage(
             explicit=step >= self.first_stage,
             learn_mask=not self.mask_paused(step) and falls_on(step + taken - 1, taken, self.mask_every),
             sh_degree=min(step // self.sh_every, sh_degree),
             learn_encoder=falls_on(step + taken - 1, taken, self.encoder_every),
-            # On other steps than the mask, so that all steps take alike.
+            # Not on the mask's steps, so that all steps take the same time.
             learn_planes=falls_on(step + taken, taken, self.planes_every),
         )
 
     def mask_paused(self, step: int) -> bool:
-        """Whether an opacity reset lies less than `mask_pause` steps back."""
+        """Whether the last opacity reset is less than `mask_pause` steps ago."""
         if not self.reset_every:
             return False
         last = min(step, self.densify_until - 1) // self.reset_every * self.reset_every
         return last > 0 and step - last < self.mask_pause
 
     def densifies(self, step: int, taken: int = 1) -> bool:
-        """Whether the Gaussians are densified after this step, which counted for `taken`."""
+        """Whether the Gaussians are densified after this step, which counts as `taken` steps."""
         due = self.densify_every > 0 and falls_on(step, taken, self.densify_every)
         return self.densify_from < step < self.densify_until and due
 
     def resets(self, step: int, taken: int = 1) -> bool:
-        """Whether opacities are reset after this step, which counted for `taken`."""
+        """Whether opacities are reset after this step, which counts as `taken` steps."""
         due = self.reset_every > 0 and falls_on(step, taken, self.reset_every)
         return 0 < step < self.densify_until and due
 
     def gathers(self, step: int) -> bool:
-        """Whether screen statistics are still needed."""
+        """Whether view statistics are still needed for densification."""
         return self.densify_every > 0 and step < self.densify_until
 
 
 def falls_on(step: int, taken: int, every: int) -> bool:
-    """Whether a multiple of `every` lies among the last `taken` steps up to `step`."""
+    """Whether one of the last `taken` steps up to `step` is a multiple of `every`."""
     return step // every > (step - taken) // every
 
 

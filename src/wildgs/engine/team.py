@@ -1,4 +1,4 @@
-"""The processes that train one model, as the trainer sees them; `distributed` has the one for several processes."""
+"""The trainer's interface to the processes that train one model; `distributed` implements it for several."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ Result = TypeVar("Result")
 
 
 class LostRankError(UserError):
-    """Another process of this training ended, or does not answer."""
+    """Another process of this training ended or does not answer."""
 
 
 class DivergedRanksError(UserError):
-    """The ranks do not hold the same model any more."""
+    """The ranks no longer hold the same model."""
 
 
 class Team:
-    """The processes (ranks) that train one model, as one of them sees it; this class is a single process.
+    """The processes (ranks) that train one model. This base class stands for a single process.
 
     Attributes:
-        rank: This process, from 0.
-        size: How many there are.
+        rank: Rank of this process.
+        size: Number of processes.
         received_signal: Signal that asked this process to stop, 0 for none; sent to all ranks in the next step.
     """
 
@@ -45,56 +45,56 @@ class Team:
 
     @property
     def first(self) -> bool:
-        """Whether this is rank 0, which alone writes files and prints."""
+        """Whether this is rank 0, the only one that writes files and prints."""
         return self.rank == 0
 
     @property
     def stop_signal(self) -> int:
-        """The signal for which all ranks stop after this step, 0 for none; the same on all ranks."""
+        """The signal because of which all ranks stop after this step, 0 for none; the same on all ranks."""
         return self.received_signal
 
     @contextmanager
     def propagate_errors(self) -> Iterator[None]:
-        """Runs a block on all ranks: rank 0 alone warns, and a `UserError` on any rank ends all of them.
+        """Runs a block on all ranks: only rank 0 warns, and a `UserError` on any rank stops all of them.
 
         The block must not communicate between ranks.
 
         Raises:
-            UserError: On rank 0, with the number of the rank that failed.
+            UserError: On rank 0; the message names the rank that failed.
             ReportedError: On the other ranks.
         """
         yield
 
     def from_first(self, function: Callable[[], Result]) -> Result:
-        """Calls a function on rank 0 alone and gives its result to all ranks; errors as in `propagate_errors`."""
+        """Calls a function on rank 0 only and broadcasts its result; errors as in `propagate_errors`."""
         return function()
 
     def least(self, value: int) -> int:
-        """The smallest of all ranks' values."""
+        """The minimum over all ranks."""
         return value
 
     def require_same(self, facts: Mapping[str, str]) -> None:
         """Raises `UserError` if the ranks differ in one of these facts."""
 
     def share(self, tensors: Iterable[Tensor]) -> None:
-        """Gives rank 0's values to all ranks, in place."""
+        """Broadcasts rank 0's values to all ranks, in place."""
 
     def average(self, parameters: Iterable[Tensor], losses: Losses) -> Losses:
         """Replaces gradients by their means over the ranks; returns the mean losses, detached.
 
-        A parameter without a gradient on some ranks counts as zero there; without one on all, it keeps none.
+        A gradient that is missing on some ranks counts as zero there.
 
         Raises:
-            LostRankError: A rank is gone.
+            LostRankError: A rank ended or does not answer.
             DivergedRanksError: The ranks' models differ in size.
         """
         return losses
 
     def pool(self, statistics: ViewStatistics) -> ViewStatistics:
-        """All ranks' statistics as one: sums and maxima.
+        """Combines the statistics of all ranks by sums and maxima.
 
         Raises:
-            LostRankError: A rank is gone.
+            LostRankError: A rank ended or does not answer.
         """
         return statistics
 
@@ -102,7 +102,7 @@ class Team:
 def same_everywhere(
     method: Method, views: Sequence[View], config: object, precision: torch.dtype
 ) -> dict[str, str]:
-    """What must be the same on all ranks before training begins, for `Team.require_same`."""
+    """Properties that must be the same on all ranks before training, for `Team.require_same`."""
     shapes = {name: tuple(value.shape) for name, value in method.state_dict().items()}
     return {
         "version of wildgs": __version__,

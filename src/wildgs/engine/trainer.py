@@ -1,4 +1,4 @@
-"""The training loop. It prints and writes nothing: observers watch it, and `state` is what a checkpoint holds."""
+"""The training loop, without output of its own: observers are called after every step."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ FEATURE_CACHE_BYTES = 10**9
 
 @dataclass(frozen=True)
 class StepReport:
-    """What an observer gets after every step.
+    """The result of a step, for observers.
 
-    No tensor in it holds the step's autograd graph: a graph that lives on into the next step keeps that step's
-    tile lists in memory, and its gradient accumulators, which are bound to the default stream, would invalidate
-    the capture of a CUDA graph.
+    All tensors are detached from the autograd graph. A graph that outlives the step would keep its tile lists in
+    memory, and its gradient accumulators, which are bound to the default stream, would invalidate the capture of a
+    CUDA graph.
 
     Attributes:
         step: Number of steps done, from 1.
-        view: The photo that was trained on.
-        losses: Every term, detached; tensors, so that nothing waits for the device unless they are read.
-        rendering: The rendered photo, detached.
-        visibility: The mask M, detached; None for a method without one.
-        num_gaussians: N after the step.
-        density: What densification did, where it ran.
-        skipped: Why the step was skipped, where its loss or gradient was not finite; on a GPU, why the step before
+        view: The photo of the step.
+        losses: All loss terms, as tensors, so that only reading them synchronises with the device.
+        rendering: The render of the photo.
+        visibility: The mask M; None for a method without one.
+        num_gaussians: Number of Gaussians after the step.
+        density: Result of densification, if it ran.
+        skipped: Why the step (on a GPU: the previous step) was skipped for a non-finite loss or gradient, if it
             was.
-        taken: Steps that this one counts for: photos of all processes.
-        seconds: Training time so far, without the time that observers take.
+        taken: Number of steps that this one counts as: photos of all processes.
+        seconds: Training time so far, without that of observers.
     """
 
     step: int
@@ -74,7 +74,7 @@ class StepReport:
     taken: int = 1
 
     def falls_on(self, every: int) -> bool:
-        """Whether this step is, or passed, a multiple of `every`."""
+        """Whether this step reaches or passes a multiple of `every`."""
         return falls_on(self.step, self.taken, every)
 
 
@@ -85,31 +85,34 @@ class Trainer:
     """Trains a method on a scene's training photos.
 
     Attributes:
-        on_final_photo: Called with (photos shown, photos in all) while the method sees photos after the last step.
-        cuda_graphs: Whether networks are recorded and replayed as CUDA graphs, where there is CUDA.
-        feature_cache: Bytes for the features that a frozen encoder gave of training photos.
-        skips_on_device: Whether steps that are not finite are skipped without waiting for the device.
+        on_final_photo: Called with (photos done, total number of photos) during `Method.finish` after the last
+            step.
+        cuda_graphs: Whether networks are captured and replayed as CUDA graphs (on CUDA devices).
+        feature_cache: Memory for a frozen encoder's features of training photos, bytes.
+        skips_on_device: Whether non-finite steps are skipped without synchronisation.
     """
 
     def __init__(self, method: Method, scene: Scene, config: TrainConfig, team: Team | None = None) -> None:
         """Prepares training at step 0.
 
         Args:
-            method: Trained in place, on the device of its parameters.
-            scene: The photos; nothing of it under `truth/` is read.
+            method: The method, which is trained in place on the device of its parameters.
+            scene: The scene; its ground truth is not used.
             config: Training options.
-            team: The processes that train this model; by default this one alone.
+            team: The processes that train this model. Default: this process alone.
 
         Raises:
-            UserError: There is no photo to train on, or there are fewer photos than processes.
+            UserError: There are no training photos, or fewer than processes.
         """
         self.views = scene.train_views
         self.team = team or Team()
         if not self.views:
-            raise UserError(f"{scene.root}: no photo to train on; the split leaves none that has a camera")
+            raise UserError(
+                f"{scene.root}: no training photo has a camera; change the split or the COLMAP model"
+            )
         if len(self.views) < self.team.size:
             raise UserError(
-                f"{scene.root}: {len(self.views)} photos to train on are too few for {self.team.size} processes; "
+                f"{scene.root}: {len(self.views)} training photos are too few for {self.team.size} processes; "
                 f"use at most {len(self.views)}"
             )
         self.method = method
@@ -138,7 +141,7 @@ class Trainer:
         """Trains until `config.steps`; every observer is called after every step.
 
         Raises:
-            TrainingDivergedError: Too many steps in a row had no finite loss or gradient.
+            TrainingDivergedError: Too many consecutive steps had a non-finite loss or gradient.
         """
         try:
             self.begin()
@@ -153,10 +156,10 @@ class Trainer:
             self.end()
 
     def begin(self) -> None:
-        """Prepares the method and this process for `advance`; `run` calls it. `end` undoes it.
+        """Prepares the method and this process for `advance`; called by `run` and undone by `end`.
 
         Raises:
-            UserError: The ranks cannot train one model: their photos, models or versions differ.
+            UserError: Photos, models or versions differ between the ranks.
         """
         self._process.begin()
         precision = choose_precision(self.config.precision, self.device)
@@ -170,14 +173,14 @@ class Trainer:
         keep_features(self.method, FeatureCache(self.feature_cache))
 
     def end(self) -> None:
-        """Undoes `begin`: float32, no CUDA graphs, and the process's settings as they were before."""
+        """Undoes `begin`: float32, no CUDA graphs, and the previous settings of the process."""
         set_precision(self.method, torch.float32)
         switch_replays(self.method, False)
         keep_features(self.method, None)
         self._process.end()
 
     def advance(self) -> StepReport:
-        """One step: a photo on every rank."""
+        """Takes one step with one photo per rank."""
         start = time.perf_counter()
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
@@ -185,7 +188,9 @@ class Trainer:
         output, losses = self._forward(view, photo, keep)
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
-            seen = SeenView(output.projection, output.rendering.colors, photo, self._counting(output, keep))
+            seen = SeenView(
+                output.projection, output.rendering.colors, photo, self._static_pixels(output, keep)
+            )
         skipped = self._report_marked()
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
@@ -209,7 +214,7 @@ class Trainer:
         )
 
     def _take(self, seen: SeenView | None, losses: Losses) -> str | None:
-        """Lets the optimisers take the step unless it is not finite; why it was skipped, where that is known."""
+        """Takes the optimisers' step if it is finite; returns why it was skipped, if already known."""
         if self.skips_on_device:
             faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
             if seen is not None:
@@ -227,7 +232,7 @@ class Trainer:
                 self.guard.report(self.step + 1, fault, self.method)
         return fault
 
-    def _counting(
+    def _static_pixels(
         self, output: TrainingOutput, keep: Bool[Tensor, "H W"] | None
     ) -> Bool[Tensor, "H W"] | None:
         """Pixels that are neither transient nor masked by the user."""
@@ -237,7 +242,7 @@ class Trainer:
         return static if keep is None else static & keep
 
     def _report_marked(self) -> str | None:
-        """Reports the step before where it was skipped by the GPU, which has finished it by now; why it was."""
+        """Reports the previous step if the GPU, which has finished it by now, skipped it; returns the reason."""
         found = self.guard.judge_marked()
         if found is None:
             return None
@@ -273,7 +278,7 @@ class Trainer:
 
     def _control_density(self, taken: int) -> DensityReport | None:
         report = None
-        # Before densification, whose new Gaussians look as if no photo had ever shown them.
+        # Before densification, because its new Gaussians count as unseen.
         if self.schedule.resets(self.step, taken):
             self.density.reset_opacity(self.method.gaussians, self.optimizers.rows, self.method.growable())
         if self.schedule.densifies(self.step, taken):
@@ -289,7 +294,7 @@ class Trainer:
         return report
 
     def shrink_to_budget(self) -> int:
-        """Drops Gaussians beyond `density.max_gaussians`, where that was lowered since; returns how many."""
+        """Prunes Gaussians if `density.max_gaussians` was lowered; returns their number."""
         budget = self.config.density.max_gaussians
         excess = self.density.shrink(self.method.gaussians, self.optimizers.rows, budget)
         if excess:
@@ -299,14 +304,14 @@ class Trainer:
         return excess
 
     def _prepare(self) -> None:
-        """Sorts the Gaussians in space, and shows the method a few photos, spread over the collection."""
+        """Sorts the Gaussians in Morton order and calls `Method.prepare` with a few photos."""
         sort_rows(self.method.gaussians, self.optimizers.rows)
         stride = max(1, len(self.views) // PREPARATION_PHOTOS)
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
     def _finish(self) -> None:
-        """Shows the method some training photos once more."""
+        """Calls `Method.finish` with some training photos."""
         start = time.perf_counter()
         switch_replays(self.method, False)
         self.method.finish(self._final_photos())
@@ -322,7 +327,7 @@ class Trainer:
             self.on_final_photo(number + 1, count)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that training needs to continue exactly, as flat tensors."""
+        """The complete state of training by name, sufficient to continue bitwise identically."""
         state = {f"method.{name}": value for name, value in self.method.state_dict().items()}
         state |= {f"optimizer.{name}": value for name, value in self.optimizers.state().items()}
         state |= {f"sampler.{name}": value for name, value in self.sampler.state().items()}
@@ -335,11 +340,13 @@ class Trainer:
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Continues from `state`; the method must have been restored from the same checkpoint already."""
+        """Continues from `state`; the method must be restored from the same checkpoint before."""
         self.optimizers.restore(_under(state, "optimizer."))
         if not self.sampler.restore(_under(state, "sampler.")):
-            message = f"the run began with other photos than the {len(self.views)} that train now"
-            warnings.warn(f"{message}; it continues with these", WildGSWarning, stacklevel=2)
+            message = (
+                f"the run was started with other photos and continues with the present {len(self.views)}"
+            )
+            warnings.warn(message, WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))
         self.generator.set_state(state["random.generator"])
         self._process.set_random_states(_under(state, "random."))

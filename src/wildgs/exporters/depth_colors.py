@@ -1,11 +1,11 @@
-"""Colours for depth and for masks over photos."""
+"""Colour maps for depth, and masks over photos."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-# Nine entries of matplotlib's "inferno" (CC0), a map whose lightness grows evenly from black to pale yellow.
+# Nine entries of matplotlib's perceptually uniform colour map "inferno" (CC0).
 _INFERNO = np.array(
     [
         (0, 0, 4),
@@ -26,24 +26,24 @@ HIDDEN_TINT = np.array([230.0, 40.0, 40.0])
 
 def color_depth(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
     """Colour map of disparity: near is bright, far is dark, missing depth (0 or non-finite) is grey."""
-    known = np.isfinite(depth) & (depth > 0.0)
+    valid = np.isfinite(depth) & (depth > 0.0)
     picture = np.empty((*depth.shape, 3), dtype=np.uint8)
     picture[:] = _NO_DEPTH
-    if not known.any():
+    if not valid.any():
         return picture
-    disparity = 1.0 / depth[known]
+    disparity = 1.0 / depth[valid]
     low, high = np.quantile(disparity, [0.01, 0.99])
     share = np.clip((disparity - low) / max(high - low, 1e-12), 0.0, 1.0)
     stops = np.linspace(0.0, 1.0, len(_INFERNO))
     channels = [np.interp(share, stops, _INFERNO[:, c]) for c in range(3)]
-    picture[known] = np.stack(channels, axis=-1).round().astype(np.uint8)
+    picture[valid] = np.stack(channels, axis=-1).round().astype(np.uint8)
     return picture
 
 
 def tint_hidden(
     photo: UInt8[np.ndarray, "H W 3"], visibility: Float[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The photo, greyed, with red where visibility M is low."""
+    """The photo in grey, tinted red where the visibility M is low."""
     grey = photo.mean(axis=2, keepdims=True).repeat(3, axis=2)
     hidden = (1 - np.clip(visibility, 0, 1))[..., None]
     return ((1 - 0.8 * hidden) * grey + 0.8 * hidden * HIDDEN_TINT).round().astype(np.uint8)

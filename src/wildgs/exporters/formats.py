@@ -20,10 +20,10 @@ SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog"]
 """File extensions: 3DGS, PlayCanvas compressed PLY, antimatter15, Niantic SPZ, and PlayCanvas SOG."""
 
 SpzVersion = Literal[3, 4]
-"""Of .spz: 4 is compressed by Zstandard, 3 by gzip."""
+"""Versions of .spz: 4 is compressed by Zstandard, 3 by gzip."""
 
 _LEAST_OPACITY = 1e-6
-"""Opacities closer to 0 or 1 have no finite logit in single precision."""
+"""Opacities are kept this far from 0 and 1, so that their logits are finite in single precision."""
 
 _SPZ_HALF_RANGE = 2**23
 """Coordinates in .spz are signed fixed-point numbers of 24 bits."""
@@ -32,19 +32,18 @@ _SPZ_HALF_RANGE = 2**23
 def write_splats(
     file: Path, splats: Splats, kind: SplatFormat, *, full_sh: bool = True, spz_version: SpzVersion = 4
 ) -> None:
-    """Writes Gaussians, in the frame of the file, to a file; missing folders are created.
+    """Writes Gaussians to a file; missing folders are created.
 
-    `ply` is lossless. The others quantise, and `splat` keeps harmonics of degree 0 only. The axes of the Gaussians
-    are kept; COLMAP and 3DGS programs read them as x right, y down, z forward. Only `spz`, which specifies x right,
-    y up, z backward, is rotated by 180 degrees about x.
+    `ply` is lossless. The others quantise, and `splat` has harmonics of degree 0 only. Axes are not changed (x
+    right, y down, z forward in COLMAP and 3DGS programs), except for `spz`, which specifies x right, y up, z
+    backward, and is rotated by 180 degrees about x.
 
     Args:
         file: The file.
-        splats: The Gaussians.
-        kind: Its format.
-        full_sh: Of `ply`: write harmonics of degree 3, with zeros for degrees that the Gaussians do not have, since
-            many programs read no other layout.
-        spz_version: Of `spz`: 4 (Zstandard; what PlayCanvas reads) or 3 (gzip; what older programs read).
+        splats: The Gaussians, in the frame of the file.
+        kind: The file format.
+        full_sh: For `ply`: pad harmonics to degree 3 with zeros, since many programs read no other layout.
+        spz_version: For `spz`: 4 (Zstandard, read by PlayCanvas) or 3 (gzip, read by older programs).
 
     Raises:
         UserError: The format needs a package that is not installed, or the package fails.
@@ -58,7 +57,7 @@ def write_splats(
 
 
 def ply_bytes(splats: Splats, *, full_sh: bool = False) -> bytes:
-    """Content of a .ply file in the layout of the original 3DGS, which all 3DGS programs read.
+    """Content of a .ply file in the layout of the original 3DGS.
 
     Per Gaussian, as 32-bit floats: x y z, an unused normal, f_dc (degree 0, r g b), f_rest (higher degrees: all of
     red, then green, then blue), opacity (logit), scale (logarithm), rot (unit quaternion w x y z). `full_sh` writes
@@ -100,7 +99,7 @@ def _by_gaussforge(splats: Splats, kind: SplatFormat) -> bytes:
 
 
 def _by_gsply(splats: Splats, kind: SplatFormat, spz_version: SpzVersion) -> bytes:
-    """Converts through files, since gsply has no other interface for both formats."""
+    """Converts through files, because gsply has no other interface for both formats."""
     gsply = _package("gsply", kind)
     spz = kind == "spz"
     placed = splats.rotated(torch.diag(torch.tensor([1.0, -1.0, -1.0]))) if spz else splats
@@ -118,7 +117,7 @@ def _by_gsply(splats: Splats, kind: SplatFormat, spz_version: SpzVersion) -> byt
 
 
 def _spz_bits(splats: Splats) -> int:
-    """Number of fractional bits of the 24 with which the furthest Gaussian does not overflow."""
+    """Largest number of fractional bits, of 24, with which no coordinate overflows."""
     reach = max(float(splats.means.abs().max()), 1e-6)
     bits = math.floor(math.log2((_SPZ_HALF_RANGE - 1) / reach))
     if bits < 0:

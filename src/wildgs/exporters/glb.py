@@ -1,8 +1,8 @@
 """GLB files with the ratified glTF extension KHR_gaussian_splatting: one geometry, one scene for each light.
 
-Accessors of positions, rotations, scales and opacities are the same in all scenes. Degree 0 of the harmonics is
-each light's own. Higher degrees are one accessor for all lights, of which each light replaces some rows (sparse
-accessors). Variants (KHR_materials_variants) exchange materials, which splats do not have, so lights are scenes.
+All scenes share the accessors of positions, rotations, scales and opacities. Harmonics of degree 0 are separate for
+each light. Higher degrees have one accessor for all lights, in which each light replaces some rows (sparse
+accessors). KHR_materials_variants does not apply, since it exchanges materials, which splats do not have.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MOST_BYTES = 2**32 - 1
 
 @dataclass
 class _Document:
-    """The parts of a glTF file to which arrays are added one after the other."""
+    """A glTF document under construction."""
 
     chunks: list[bytes] = field(default_factory=list)
     length: int = 0
@@ -57,7 +57,7 @@ class _Document:
         return self.add_accessor(self.add_view(values), values, **more)
 
     def add_accessor(self, view: int, values: np.ndarray, **more: Any) -> int:
-        """Describes a stored array once more; returns the index of the accessor."""
+        """Adds an accessor for a stored array; returns its index."""
         kind = _FLOAT if values.dtype == np.float32 else _BYTE
         accessor = {"bufferView": view, "componentType": kind, "count": len(values)}
         self.accessors.append(accessor | {"type": _SIZES[values.shape[1]]} | more)
@@ -68,11 +68,11 @@ def glb_bytes(scene: RelightableScene, harmonics: SharedHarmonics) -> bytes:
     """Content of a GLB file.
 
     Args:
-        scene: Geometry, and what identifies each light; harmonics of `scene.lights` are ignored.
-        harmonics: The harmonics of its lights.
+        scene: Geometry and metadata of the lights; the harmonics of `scene.lights` are ignored.
+        harmonics: The harmonics of the lights.
 
     Raises:
-        UserError: The file would be larger than the 4 GiB that GLB can have.
+        UserError: The file would be larger than 4 GiB, the limit of GLB.
     """
     document = _Document()
     geometry = _add_geometry(document, scene)
@@ -116,7 +116,7 @@ def glb_bytes(scene: RelightableScene, harmonics: SharedHarmonics) -> bytes:
 def _add_geometry(document: _Document, scene: RelightableScene) -> dict[str, int]:
     splats = scene.splats
     means = splats.means.float().numpy()
-    quats = torch.nn.functional.normalize(splats.quats, dim=1).roll(-1, dims=1)  # as x, y, z, w
+    quats = torch.nn.functional.normalize(splats.quats, dim=1).roll(-1, dims=1)  # to x, y, z, w
     ends = {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     return {
         "POSITION": document.add(means, **ends),
@@ -129,7 +129,7 @@ def _add_geometry(document: _Document, scene: RelightableScene) -> dict[str, int
 def _add_base(
     document: _Document, harmonics: SharedHarmonics, light: int, scene: RelightableScene
 ) -> dict[str, int]:
-    """Degree 0 of one light, and linear colours of points for programs that do not know the extension."""
+    """Degree 0 of one light, and linear point colours for programs without support for the extension."""
     base = harmonics.base[light].float()
     shown = (0.5 + 0.28209479177387814 * base).clamp(0, 1)
     linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
@@ -143,7 +143,7 @@ def _add_base(
 def _add_rest(
     document: _Document, harmonics: SharedHarmonics, light: int, rest: list[np.ndarray], views: list[int]
 ) -> dict[str, int]:
-    """The higher degrees of one light: the shared ones, in which some rows are replaced."""
+    """The higher degrees of one light: the shared ones with some rows replaced."""
     rows, own = harmonics.rows[light], harmonics.own[light].float()
     names = [
         f"{EXTENSION}:SH_DEGREE_{math.isqrt(basis)}_COEF_{basis - math.isqrt(basis) ** 2}"
@@ -178,7 +178,7 @@ def _camera(scene: RelightableScene) -> dict[str, Any]:
 
 
 def _camera_node(camera: Camera) -> dict[str, Any]:
-    """Node of the camera: in glTF it looks along -z, with +y up."""
+    """Node of the camera, which looks along -z with +y up in glTF."""
     axes = camera.viewmat[:3, :3].double().T @ torch.diag(
         torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     )
@@ -196,7 +196,7 @@ def _container(text: bytes, document: _Document) -> bytes:
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + document.length
     if total > _MOST_BYTES:
-        raise UserError("a .glb file holds at most 4 GiB; give fewer lights, or a lower --sh-degree")
+        raise UserError("a .glb file is limited to 4 GiB; give fewer lights, or a lower --sh-degree")
 
     def words(*values: int) -> bytes:
         return np.array(values, dtype="<u4").tobytes()

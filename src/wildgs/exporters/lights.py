@@ -1,4 +1,4 @@
-"""The lights of one file: harmonics that they share, what identifies each, and the frame that viewers expect."""
+"""Several lights in one file: shared harmonics, metadata, and the frame with +y up."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wildgs.geometry.spherical_harmonics import sh_basis
 from wildgs.scene.scene import Alignment
 
 Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
-"""From the aligned frame (+z up) to that of glTF and most of USD (+y up)."""
+"""Rotation from the aligned frame (+z up) to that of glTF and most USD files (+y up)."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class ExportLight:
     """One light of a file.
 
     Attributes:
-        name: The photo's or picture's name.
+        name: Name of the photo or image.
         sh: Spherical harmonics of all Gaussians.
-        thumbnail: Picture of any size, from which a small one is cut.
-        captured: Local time at which the photo was taken, ISO 8601; None where it is not known.
+        thumbnail: Image of any size, which is cropped and reduced.
+        captured: Local capture time of the photo, ISO 8601; None if unknown.
     """
 
     name: str
@@ -42,11 +42,11 @@ class RelightableScene:
 
     Attributes:
         title: Name of the scene.
-        splats: Geometry; its own harmonics are ignored.
-        lights: At least one.
+        splats: Geometry; its harmonics are ignored.
+        lights: At least one light.
         start: Camera of the initial view, in the same frame.
-        near: Near plane, world units.
-        placement: From the file's frame to that of the input COLMAP model.
+        near: Near plane, in units of the file's frame.
+        placement: Transform from the file's frame to that of the COLMAP model.
     """
 
     title: str
@@ -58,11 +58,11 @@ class RelightableScene:
 
 
 def upright(alignment: Alignment, *, aligned: bool) -> Alignment:
-    """From the aligned frame to a file's with +y up.
+    """The transform from the aligned frame to a file's frame with +y up.
 
     Args:
-        alignment: From the input's frame to the aligned one.
-        aligned: Keep origin and scale of the aligned frame, instead of those of the input.
+        alignment: Transform from the COLMAP model's frame to the aligned frame.
+        aligned: Keep origin and scale of the aligned frame instead of those of the COLMAP model.
     """
     if aligned:
         return Alignment(Y_UP, torch.zeros(3, dtype=torch.float64))
@@ -72,13 +72,13 @@ def upright(alignment: Alignment, *, aligned: bool) -> Alignment:
 
 @dataclass(frozen=True)
 class SharedHarmonics:
-    """Harmonics of several lights, of which only the degree 0 and some Gaussians' higher degrees are apart.
+    """Harmonics of several lights that share the higher degrees of most Gaussians.
 
     Attributes:
-        rest: Higher degrees that all lights share.
+        rest: Higher degrees shared by all lights.
         base: Degree 0 of each light.
-        rows: Gaussians that have higher degrees of their own, ascending, for each light.
-        own: Their higher degrees.
+        rows: For each light, ascending indices of the Gaussians with separate higher degrees.
+        own: For each light, the higher degrees of these Gaussians.
     """
 
     rest: Float[Tensor, "N M 3"]
@@ -103,16 +103,17 @@ def share_harmonics(
     viewpoints: Float[Tensor, "V 3"],
     own_share: float,
 ) -> SharedHarmonics:
-    """Gives most Gaussians the same higher degrees under all lights.
+    """Shares the higher degrees of most Gaussians among all lights.
 
-    The shared degrees are the mean over the lights. Degree 0 of each light takes up the difference, averaged over
-    the directions from the cameras. The Gaussians for which this changes the pictures most keep their own.
+    The shared degrees are the mean over the lights. Degree 0 of each light absorbs the difference, averaged over
+    the directions from the cameras. The Gaussians for which this changes the images most keep separate higher
+    degrees.
 
     Args:
         splats: Geometry.
         lights: Harmonics of each light.
         viewpoints: Camera centres in the same frame.
-        own_share: Share of the Gaussians that keep their own higher degrees in each light.
+        own_share: Fraction of the Gaussians with separate higher degrees for each light.
     """
     stack = torch.stack(list(lights))
     count, bases = stack.shape[1:3]
@@ -140,7 +141,7 @@ def share_harmonics(
 def _directions(
     splats: Splats, viewpoints: Float[Tensor, "V 3"], degree: int, chunk: int = 8192
 ) -> tuple[Float[Tensor, "N K"], Float[Tensor, "N M M"]]:
-    """Mean of the basis over the directions from the cameras, and covariance of its higher degrees."""
+    """Mean of the SH basis over the directions from the cameras, and covariance of its higher degrees."""
     means, spreads = [], []
     for part in splats.means.split(chunk):
         towards = torch.nn.functional.normalize(part[:, None] - viewpoints.to(part), dim=-1)
@@ -152,11 +153,11 @@ def _directions(
 
 
 _MOST_AREA = 0.05
-"""Bound of a Gaussian's area in the pictures, relative to the squared focal length, for those at a camera."""
+"""Upper bound of a Gaussian's area in the image, relative to the squared focal length."""
 
 
 def _picture_area(splats: Splats, viewpoints: Float[Tensor, "V 3"]) -> Float[Tensor, " N"]:
-    """Roughly how large each Gaussian is in the photos: product of its longer axes over its squared distance."""
+    """Approximate image area of each Gaussian: product of its two longer axes over its squared distance."""
     distance = torch.cdist(splats.means, viewpoints.to(splats.means)).median(dim=1).values.clamp_min(1e-6)
     longest = splats.scales.sort(dim=1, descending=True).values
     return (longest[:, 0] * longest[:, 1] / distance.square()).clamp_max(_MOST_AREA)

@@ -1,4 +1,4 @@
-"""A self-contained web page with a scene under several appearances: opens from disk, without server or network."""
+"""A self-contained web page with a scene under several appearances, which needs neither server nor network."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
 
 BUDGET_BYTES = 25_000_000
-"""Size limit of a page; degrees of the spherical harmonics are dropped to stay below it."""
+"""Size limit of a page; spherical harmonics are truncated to stay below it."""
 
 _MIDDLE = 0.3
-"""Half size of the central part of a picture whose points give the distance of the landmark."""
+"""Half the size of the central part of an image whose points determine the depth of the landmark."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PageLight:
     Attributes:
         name: Caption of the thumbnail.
         sh: Spherical harmonics of all Gaussians.
-        thumbnail: Picture of any size; its centre is shown.
+        thumbnail: Image of any size; its centre is shown.
     """
 
     name: str
@@ -48,7 +48,7 @@ class PageLight:
 
 @dataclass(frozen=True)
 class PageView:
-    """Initial view of the page: a camera in the aligned frame (+z up), and the depth of the centre of orbiting."""
+    """Initial view of the page: a camera in the aligned frame, and the depth of the centre of rotation."""
 
     camera: Camera
     depth: float
@@ -59,13 +59,13 @@ class Page:
     """Content of a page.
 
     Attributes:
-        title: Headline.
-        summary: Sentence in its help panel.
-        splats: Geometry, in the aligned frame of the scene.
+        title: Title.
+        summary: Sentence in the help panel.
+        splats: Geometry, in the aligned frame.
         lights: Appearances, from left to right.
         start: Initial view.
-        near: Near plane, world units.
-        day: Whether the lights are those of a day in order, which the page can play.
+        near: Near plane, in units of the aligned frame.
+        day: Whether the lights are in the order of a day, which the page can play.
     """
 
     title: str
@@ -90,14 +90,14 @@ def write_page(
         page: Content.
         file: HTML file; missing folders are created.
         viewpoints: Camera centres; truncated harmonics are fitted to the directions from them.
-        sh_degree: Degree of the spherical harmonics; None takes the highest that keeps the page below
+        sh_degree: Degree of the spherical harmonics; None takes the highest with which the page stays below
             `BUDGET_BYTES`.
 
     Returns:
         Degree of the spherical harmonics in the page.
 
     Raises:
-        ValueError: The page has no light or no Gaussian.
+        ValueError: The page has no light or no Gaussians.
     """
     own = page.splats.sh_degree
     content = b""
@@ -142,7 +142,7 @@ def _compose(page: Page, scene: PackedScene) -> str:
 
 
 def script_json(value: Any) -> str:
-    """JSON that cannot close the enclosing script element, whatever file names it contains."""
+    """JSON in which HTML characters are escaped, so that file names cannot close the script element."""
     return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -158,14 +158,14 @@ def _start(view: PageView) -> dict[str, Any]:
 
 
 def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tuple[int, float]:
-    """Chooses the photo from which the landmark is seen whole and large.
+    """Chooses a photo that shows the landmark complete and large.
 
     Args:
         cameras: Cameras of the training photos, at least one.
         points: SfM points in the same frame.
 
     Returns:
-        Index of the camera, and the depth of the landmark in it, world units.
+        Index of the camera, and the depth of the landmark in its view.
     """
     scores = torch.tensor([_score(camera, points) for camera in cameras])
     best = int(scores.argmax())
@@ -180,9 +180,9 @@ def _project(camera: Camera, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tens
 
 
 def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Share of the points inside the picture, times the share of the picture that they cover.
+    """Fraction of the points inside the image, times the fraction of the image that they cover.
 
-    The first factor is small for cameras that are too close, the second for those too far away.
+    The first factor is small for cameras that are too close, the second for those that are too far away.
     """
     places, _ = _project(camera, points)
     inside = places[((places >= 0) & (places <= 1)).all(dim=1)]
@@ -193,7 +193,7 @@ def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
 
 
 def _depth(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Median depth of the points in the central part of the picture."""
+    """Median depth of the points in the central part of the image."""
     places, depths = _project(camera, points)
     middle = ((places - 0.5).abs() < _MIDDLE).all(dim=1)
     chosen = depths[middle] if bool(middle.any()) else depths

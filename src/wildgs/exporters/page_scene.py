@@ -1,8 +1,8 @@
-"""Binary encoding of the scene inside the web page: the geometry once, then the colours of each appearance.
+"""Binary encoding of the scene in the web page: geometry, and the colours of each appearance.
 
-Everything is quantised to bytes and stored in planes (all first bytes, then all second bytes, ...), with Gaussians
-in Morton order, so that neighbours in space are neighbours in the file and gzip compresses well. Appearances after
-the first are stored as differences from it, modulo 256. `web/src/scene.js` is the decoder.
+All values are quantised to bytes and stored in planes (all first bytes, then all second bytes, ...), with Gaussians
+in Morton order, so that gzip compresses well. Appearances after the first are stored as differences from it, modulo
+256. `web/src/scene.js` is the decoder.
 
     means      asinh of each coordinate, 24 bits between minimum and maximum, high byte first
     scales     logarithm, 8 bits
@@ -25,7 +25,7 @@ from wildgs.exporters.splats import Splats
 from wildgs.geometry.morton import morton_order
 
 _TAIL = 2e-4
-"""Share of the coefficients that is clipped at either end of a range, for finer steps within it."""
+"""Fraction of the coefficients that is clipped at either end of a range, for finer steps within it."""
 
 Planes = list[tuple[str, UInt8[np.ndarray, "C N"]]]
 
@@ -50,7 +50,7 @@ def pack_scene(splats: Splats, lights: Sequence[Float[np.ndarray, "N K 3"]]) -> 
     """
     if not lights or not len(splats):
         raise ValueError("a page needs at least one light and one Gaussian")
-    # The whole box in the finest cells: neighbours in the file are then as alike as they can be, and compress well.
+    # Morton order at the finest resolution over the whole bounding box compresses best.
     order = morton_order(splats.means.double().asinh(), bits=21, outside=0.0).numpy()
     header: dict[str, Any] = {"count": len(order), "sh_degree": int(np.sqrt(lights[0].shape[1])) - 1}
     planes: Planes = []

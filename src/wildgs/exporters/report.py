@@ -1,4 +1,4 @@
-"""Report of a run: one HTML file with scores and embedded pictures, which opens without server or network."""
+"""Report of a run: one HTML file with scores and embedded images, which needs neither server nor network."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ MASK_SIDE = 240
 
 @dataclass(frozen=True)
 class ReportExample:
-    """Pictures of one view.
+    """Images of one view.
 
     Attributes:
         name: Name of the photo.
         photo: The photo.
         render: Render of this view under the appearance of the photo.
         mask: Visibility mask, 255 = static, 0 = transient.
-        depth: Rendered depth in world units (0 or non-finite = none), or a picture of it.
-        clean: The photo without its transients, if known.
+        depth: Rendered depth (0 or non-finite = none), or an image of it.
+        clean: The photo without transients (ground truth), if known.
         baseline: Render of the baseline.
         relit: Renders under other appearances: name of the other photo, that photo (of any size), and the render.
         baseline_name: Name of the baseline.
@@ -63,7 +63,7 @@ class ReportMask:
         name: Name of the photo.
         photo: The photo.
         visibility: Mask M, 1 = static; None for a method without masks.
-        caption: What was measured of it.
+        caption: Measurements of the photo.
     """
 
     name: str
@@ -78,8 +78,8 @@ class ReportUnplaced:
 
     Attributes:
         name: Name of the photo.
-        reason: Why it has none.
-        matches: The photo beside its best partner with their matches, None where it matches none.
+        reason: Why it has no pose.
+        matches: The photo beside the one it matches best, with their matches; None without matches.
     """
 
     name: str
@@ -92,13 +92,13 @@ class Report:
     """Content of a report.
 
     Attributes:
-        title: Headline.
-        summary: Paragraph below the headline.
+        title: Title.
+        summary: Paragraph below the title.
         methods: Rows of the table of scores.
         examples: Views, from top to bottom.
-        misfits: Training photos that fit no light, worst first.
+        misfits: Training photos that no appearance explains, worst first.
         masks: Other training photos and their masks, worst first.
-        poses: How photos were placed.
+        poses: Summary of structure from motion.
         unplaced: Photos without a pose.
     """
 
@@ -113,7 +113,7 @@ class Report:
 
 
 def escape(text: str) -> str:
-    """Text as HTML; characters of file names that a page cannot hold, as escapes."""
+    """Escapes text for HTML; unprintable characters become visible escapes."""
     return html.escape(printable(text))
 
 
@@ -133,7 +133,7 @@ def write_report(report: Report, file: Path) -> None:
         + _misfits(report.misfits)
         + _masks(report.masks)
         + _poses(report),
-        footer="Written by Wild-GS. All pictures are embedded; nothing is loaded from the network.",
+        footer="Written by Wild-GS. All images are embedded; nothing is loaded from the network.",
     )
     with written_aside(file) as aside:
         aside.write_text(page, encoding="utf-8")
@@ -151,16 +151,16 @@ def _examples(examples: Sequence[ReportExample]) -> str:
 
 def _misfits(photos: Sequence[ReportMask]) -> str:
     hint = (
-        "Their renders resemble them under no light, not even their own: collages, drawings, other places, wrong "
-        "poses, or parts of the scene that are not learnt. Training without them may be better. "
+        "No appearance, not even their own, makes their renders resemble them: collages, drawings, other places, "
+        "wrong poses, or parts of the scene that were not reconstructed. Training without them may be better. "
     )
-    return _beside_masks("Photos that fit no light", hint, photos)
+    return _beside_masks("Misfits", hint, photos)
 
 
 def _masks(photos: Sequence[ReportMask]) -> str:
     hint = (
-        "Static observations are points of the landmark that three photos or more agree on; a mask that hides them "
-        "is wrong. Photos that lose most of them come first. "
+        "Static observations are points of the landmark on which at least three photos agree; masks should not "
+        "hide them. Photos in which masks hide most of them come first. "
     )
     return _beside_masks("Masks of training photos", hint, photos)
 
@@ -177,7 +177,9 @@ def _poses(report: Report) -> str:
         )
     text = f'<section><h2>Camera poses</h2><p class="hint">{escape(report.poses)}</p>'
     if figures:
-        hint = "Photos without a pose, beside the photo that they match best; lines join features that agree."
+        hint = (
+            "Photos without a pose, beside the photo that they match best; lines connect matching features."
+        )
         text += f'<h3>Left out</h3><p class="hint">{hint}</p><div class="masks">{"".join(figures)}</div>'
     return text + "</section>"
 
@@ -218,7 +220,7 @@ def _example(example: ReportExample) -> str:
         for caption, alt, pixels in tiles
     )
     height, width = example.photo.shape[:2]
-    # All other pictures fit beside a portrait photo, only the tiles beside a landscape one.
+    # Beside a portrait photo all other images fit, beside a landscape photo only the tiles.
     wide = width >= height
     columns, tall, least = (2, "430px", "240px") if wide else (min(len(tiles), 4), "560px", "150px")
     layout = f"--ratio:{width / height:.4f};--columns:{columns};--tall:{tall};--least:{least}"
@@ -242,7 +244,7 @@ def _compare(example: ReportExample) -> str:
         f"{_picture(example.photo, f'Photo {name}', css='above')}"
         '<span class="knob" aria-hidden="true">&#8596;</span>'
         '<span class="tag left">photo</span><span class="tag right">render</span>'
-        f'<input type="range" min="0" max="100" value="50" aria-label="Share of {name} that shows the photo">'
+        f'<input type="range" min="0" max="100" value="50" aria-label="Fraction of {name} that shows the photo">'
         "</div><figcaption>Photo, and render under the appearance of the photo</figcaption></figure>"
     )
 

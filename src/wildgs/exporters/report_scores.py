@@ -69,7 +69,7 @@ class MethodScores:
 
 
 def _hidden_note(metrics: Mapping[str, Any]) -> list[str]:
-    """How much of what is proven static the masks hide, where that is known."""
+    """Fraction of the static observations that masks hide, if known."""
     hidden, worst = metrics.get("static_hidden"), metrics.get("static_hidden_worst")
     if hidden is None or worst is None:
         return []
@@ -111,7 +111,7 @@ def _row(method: MethodScores, methods: Sequence[MethodScores], protocols: Seque
     for protocol in protocols:
         for key, _, digits in _METRICS:
             value = method.scores.get(protocol, {}).get(key)
-            names = [name for name, on in (("first", key == "psnr"), ("best", False)) if on]
+            names = ["first"] if key == "psnr" else []
             if value is not None and _is_best(value, key, protocol, methods):
                 names.append("best")
             label = "not computed, see the notes" if value is None else f"{value:.{digits}f}"
@@ -131,8 +131,8 @@ def _row(method: MethodScores, methods: Sequence[MethodScores], protocols: Seque
 def _is_best(value: float, key: str, protocol: str, methods: Sequence[MethodScores]) -> bool:
     """Whether a value is the best of several methods; False if there is only one."""
     values = [method.scores.get(protocol, {}).get(key) for method in methods]
-    known = [v for v in values if v is not None]
-    return len(known) > 1 and value == (min(known) if key == "lpips" else max(known))
+    present = [v for v in values if v is not None]
+    return len(present) > 1 and value == (min(present) if key == "lpips" else max(present))
 
 
 def _number(value: float | int | None, digits: int) -> str:

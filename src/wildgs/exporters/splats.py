@@ -1,4 +1,4 @@
-"""Gaussians for export, as plain arrays that do not depend on the method, and what dropping some of them costs."""
+"""Gaussians for export, independent of the method: transforming and cleaning them, and measuring the loss."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Splats:
     """Gaussians under one appearance.
 
     Attributes:
-        means: Centres, world units.
+        means: Centres.
         quats: Orientations (w, x, y, z), not necessarily normalised.
-        scales: Standard deviations along the principal axes, world units, linear.
-        opacities: Opacities in [0, 1], linear.
+        scales: Standard deviations along the principal axes.
+        opacities: Opacities in [0, 1].
         sh: Spherical harmonics, 1, 4, 9 or 16 coefficients per channel.
-        sky: Which of them stand for the sky; None where the method does not tell.
+        sky: Mask of the sky Gaussians; None if the method does not know them.
     """
 
     means: Float[Tensor, "N 3"]
@@ -64,7 +64,7 @@ class Splats:
         return replace(self, sh=sh)
 
     def to_input_frame(self, alignment: Alignment) -> Splats:
-        """The Gaussians in the frame of the input COLMAP model: its origin, axes and scale."""
+        """The Gaussians in the frame of the COLMAP model."""
         return self.moved(alignment.inverse())
 
     def moved(self, motion: Alignment) -> Splats:
@@ -87,14 +87,14 @@ class Splats:
 
 
 BOX_QUANTILE = 0.02
-"""Share of the SfM points outside the crop box, on each side of each axis."""
+"""Fraction of the SfM points outside the crop box, at each end of each axis."""
 
 
 def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " N"]:
-    """Mask of the Gaussians (aligned frame) that are kept; `points` are the SfM points in the same frame.
+    """Mask of the Gaussians (aligned frame) to keep; `points` are the SfM points in the same frame.
 
     Raises:
-        UserError: The sky is to go, and nothing tells what it is.
+        UserError: The sky is to be dropped, but the method does not know which Gaussians it consists of.
     """
     keep = splats.opacities >= config.min_opacity
     if config.max_distance is not None:
@@ -106,7 +106,7 @@ def kept_rows(config: CleanupConfig, splats: Splats, points: Float[Tensor, "P 3"
         keep &= ((splats.means >= low) & (splats.means <= high)).all(dim=1)
     if config.drop_sky:
         if splats.sky is None:
-            raise UserError("--drop-sky: this run's method does not tell which Gaussians are sky; use --crop")
+            raise UserError("--drop-sky: this run's method does not know which Gaussians are sky; use --crop")
         keep &= ~splats.sky
     return keep
 
@@ -117,7 +117,7 @@ def clean(
     points: Float[Tensor, "P 3"],
     viewpoints: Float[Tensor, "V 3"],
 ) -> Splats:
-    """Gaussians after dropping and truncating as configured, all in the aligned frame of the scene.
+    """Drops Gaussians and truncates harmonics as configured; everything is in the aligned frame.
 
     Truncated harmonics are fitted to the directions from the camera centres `viewpoints`.
     """

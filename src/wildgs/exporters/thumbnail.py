@@ -1,4 +1,4 @@
-"""Small pictures of photos, as text that fits into pages and JSON."""
+"""Thumbnails as data URLs, for web pages and JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _QUALITY = 82
 
 
 def thumbnail_url(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
-    """Centre crop of a picture as a data URL."""
+    """Centre crop of an image as a data URL."""
     image = Image.fromarray(np.ascontiguousarray(pixels))
     wide, tall = THUMBNAIL
     scale = max(wide / image.width, tall / image.height)

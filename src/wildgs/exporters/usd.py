@@ -1,4 +1,4 @@
-"""OpenUSD files: one ParticleField3DGaussianSplat, whose lights are the variants of a variant set."""
+"""OpenUSD files: one ParticleField3DGaussianSplat with the lights as a variant set."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ VARIANT_SET = "light"
 ROOT, PRIM = "/Scene", "/Scene/Splats"
 
 _SIGMAS = 3.0
-"""Extent of a Gaussian in its bounding box, standard deviations."""
+"""Half extent of a Gaussian for the bounding box, in standard deviations."""
 
 
 def write_usd(file: Path, scene: RelightableScene) -> None:
     """Writes a scene with its lights; needs usd-core 26.3 or newer.
 
     Geometry is written once. Each variant of `/Scene` has its own harmonics, name, time and thumbnail. The frame is
-    +y up. USD takes lengths for metres here, as the scale of photos is unknown.
+    +y up. The unit is declared as metres, since the scale of photos is unknown.
 
     Raises:
-        UserError: usd-core is missing or too old, or the disk is full or read-only.
+        UserError: usd-core is missing or too old, or the file cannot be written.
     """
     pxr = _modules()
     with written_aside(file) as aside:
-        named = aside.with_name(aside.name + file.suffix)  # USD tells its formats by the ending
+        named = aside.with_name(aside.name + file.suffix)  # USD chooses the format by the extension
         try:
             stage = pxr.Usd.Stage.CreateNew(str(named))
             _author(pxr, stage, scene)
@@ -50,7 +50,7 @@ def write_usd(file: Path, scene: RelightableScene) -> None:
 
 
 def _modules() -> Any:
-    """The modules of usd-core, whose native code type checkers cannot see."""
+    """The modules of usd-core, imported dynamically because they have no type information."""
     try:
         names = ("Gf", "Tf", "Usd", "UsdGeom", "UsdVol", "Vt")
         pxr = SimpleNamespace(**{name: importlib.import_module(f"pxr.{name}") for name in names})
@@ -83,7 +83,7 @@ def _author(pxr: Any, stage: Any, scene: RelightableScene) -> None:
 
 
 def variant_names(pxr: Any, names: list[str]) -> list[str]:
-    """Names of photos as identifiers that USD accepts, each once."""
+    """Converts names of photos to unique USD identifiers."""
     found: list[str] = []
     for name in names:
         valid, number = pxr.Tf.MakeValidIdentifier(printable(Path(name).stem)), 2
@@ -124,7 +124,7 @@ def _rows(values: Tensor) -> np.ndarray:
 
 
 def _plain(pxr: Any, numbers: dict[str, Any]) -> dict[str, Any]:
-    """A similarity in types that USD dictionaries hold."""
+    """Converts a similarity transform to types of USD dictionaries."""
     return {
         "rotation": pxr.Gf.Matrix3d(*[value for row in numbers["rotation"] for value in row]),
         "translation": pxr.Gf.Vec3d(*numbers["translation"]),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ MUXERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 
 SUFFIXES = tuple(MUXERS)
 OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
-"""Extensions of unsupported files, which are not mistaken for folder names."""
+"""Extensions of unsupported formats, which are not accepted as folder names."""
 
 ENCODING: dict[str, Any] = {
     "codec": "libx264",
@@ -29,7 +27,7 @@ ENCODING: dict[str, Any] = {
     "macro_block_size": 2,
     "output_params": ["-crf", "18", "-movflags", "+faststart"],
 }
-"""H.264 that plays in all browsers, visually lossless."""
+"""Visually lossless H.264 that all browsers play."""
 
 Frames = Iterable[UInt8[np.ndarray, "H W 3"]]
 
@@ -46,13 +44,13 @@ def check_output(path: Path) -> None:
         UserError: The video format is not supported, or imageio-ffmpeg is not installed.
     """
     if path.suffix.lower() in OTHER_MEDIA:
-        known = ", ".join(SUFFIXES)
+        supported = ", ".join(SUFFIXES)
         raise UserError(
-            f"{path}: unsupported file type; use {known}, or a name without extension for a folder of PNGs"
+            f"{path}: unsupported file type; use {supported}, or a name without extension for a folder of PNGs"
         )
     if is_video(path):
         if path.is_dir():
-            raise UserError(f"{path} is a folder; give the name of a video file")
+            raise UserError(f"{path} is a folder; give another name for the video file")
         _ffmpeg()
 
 
@@ -71,12 +69,12 @@ def write_frames(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
 
     Args:
         path: Video file or folder.
-        frames: Pictures, consumed one by one: they may be rendered as they are written.
+        frames: Images; an iterator is consumed one image at a time.
         size: Width and height of all frames in pixels; even numbers for a video.
         fps: Frames per second.
 
     Raises:
-        UserError: As `check_output` raises, or the video cannot be encoded.
+        UserError: See `check_output`; or the video cannot be encoded.
     """
     check_output(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -105,21 +103,13 @@ def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
 def _write_folder(path: Path, frames: Frames) -> None:
     if path.exists() and not path.is_dir():
         raise UserError(f"{path} is a file; give a folder for the frames")
-    with _aside(path) as folder:
+    with tempfile.TemporaryDirectory(
+        dir=path.parent, prefix=f".{path.name}.part.", ignore_cleanup_errors=True
+    ) as folder:
         for number, frame in enumerate(frames):
-            Image.fromarray(np.ascontiguousarray(frame)).save(folder / f"frame_{number:05d}.png")
+            Image.fromarray(np.ascontiguousarray(frame)).save(Path(folder, f"frame_{number:05d}.png"))
         path.mkdir(exist_ok=True)
         for old in path.glob("frame_*.png"):
             old.unlink()
-        for picture in sorted(folder.iterdir()):
+        for picture in sorted(Path(folder).iterdir()):
             picture.replace(path / picture.name)
-
-
-@contextmanager
-def _aside(path: Path) -> Iterator[Path]:
-    """A temporary folder on the same file system."""
-    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.part."))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

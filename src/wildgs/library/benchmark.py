@@ -1,4 +1,4 @@
-"""`wildgs.benchmark`: methods x ablations x seeds on any scenes, one table."""
+"""`wildgs.benchmark`: compares methods, ablations and seeds on scenes in one table."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from wildgs.version import __version__
 MOST_NOTES = 12
 CLAIM_FILE = ".bench.lock"
 FAILURE_FILE = "bench_failure.txt"
-"""In the folder of a run that failed: why. A later bench tries the run again."""
+"""Holds the reason, in the folder of a run that failed. The next benchmark tries the run again."""
 POLL_SECONDS = 2.0
 
 
@@ -53,10 +53,10 @@ class Benchmark:
     """A finished benchmark.
 
     Attributes:
-        folder: Holds table.md, table.csv, table.json and the runs.
-        rows: The table.
-        runs: How many runs the table asks for.
-        failures: Why runs failed, by title.
+        folder: The folder with table.md, table.csv, table.json and the runs.
+        rows: Rows of the table.
+        runs: Number of runs that the table consists of.
+        failures: Reasons why runs failed, by the runs' titles.
     """
 
     folder: Path
@@ -94,27 +94,28 @@ def benchmark(
     observers: Sequence[Observer] = (),
     announce: Callable[[str], None] | None = None,
 ) -> Benchmark:
-    """Trains and scores methods on scenes, for several seeds and under both protocols, and writes one table.
+    """Trains and scores methods on scenes with several seeds and both protocols, and writes one table.
 
-    The same call continues where it stopped and skips what is done. A run that fails does not stop the others.
+    Finished runs are skipped, so the same call continues after an interruption. A run that fails does not stop the
+    others.
 
     Args:
-        scenes: Scene folders; for a suite, the folder that holds its scenes.
-        config: What all runs have in common.
+        scenes: Scene folders; for a suite, the folder that contains its scenes.
+        config: Base configuration of all runs.
         output: Folder for the runs and the table.
-        methods: Lines of the table; None takes all.
-        variants: Further lines, ``NAME:KEY=VALUE[,KEY=VALUE...]``: Wild-GS with entries of config.yaml changed.
-        seeds: One run each.
+        methods: Rows of the table; None takes all.
+        variants: Additional rows, ``NAME:KEY=VALUE[,KEY=VALUE...]``: Wild-GS with entries of config.yaml changed.
+        seeds: Random seeds; each is a separate run.
         suite: `phototourism` compares with the paper's figures on its three scenes; Wild-GS, its ablations and
-            variants are then those of the preset `paper`, and so are the training options of other methods.
-        lpips: Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet.
+            variants then use the preset `paper`, and so do the training options of other methods.
+        lpips: Folder with other LPIPS weights, for example AlexNet's, than the package's SqueezeNet.
         execution: How runs are executed.
         progress: Called during all stages of all runs.
         observers: Called with a `StepReport` after every training step.
-        announce: Called with a line for every run that begins or fails, on every process.
+        announce: Called, on every process, with a line for each run that starts or fails.
 
     Raises:
-        UserError: Something that was asked for does not exist, or the output holds other runs.
+        UserError: A scene, method or variant does not exist, or the output contains runs with other settings.
     """
     check_lpips(lpips)
     lpips, execution = None if lpips is None else Path(lpips), execution or ExecutionConfig()
@@ -140,7 +141,9 @@ def _plan(
     request: _Request, scenes: Sequence[Path], base: RunConfig, methods: Sequence[str], seeds: Sequence[int]
 ) -> list[Job]:
     if not scenes or not seeds or not (methods or request.variants):
-        raise UserError("a bench needs at least one scene, one of --methods or --variant, and one of --seeds")
+        raise UserError(
+            "a benchmark needs at least one scene, one of --methods or --variant, and one of --seeds"
+        )
     if request.suite == "phototourism":
         scenes = find_phototourism(scenes)
         if base.data.downscale == 1 and base.data.max_side is None:
@@ -151,7 +154,7 @@ def _plan(
 
 
 class _Bench:
-    """Runs jobs and collects their scores; the state of a job is what its folder holds."""
+    """Runs jobs and collects their scores. The state of a job is stored in its run folder only."""
 
     def __init__(self, request: _Request, jobs: Sequence[Job]) -> None:
         self.request = request
@@ -162,7 +165,7 @@ class _Bench:
         self._scene: tuple[RunConfig, Scene] | None = None
 
     def is_done(self, job: Job) -> bool:
-        """Whether a job is trained and scored under both protocols, with the LPIPS network at hand."""
+        """Whether a job is trained, and scored under both protocols with the current LPIPS network."""
         return all(self._is_scored(job, protocol) for protocol in PROTOCOLS)
 
     def _is_scored(self, job: Job, protocol: Protocol) -> bool:
@@ -174,9 +177,9 @@ class _Bench:
         return same_network or not list_checkpoints(job.folder / CHECKPOINT_FOLDER)
 
     def open_jobs(self) -> Iterator[tuple[int, Job]]:
-        """Jobs that are neither done nor failed, with their numbers; waits for other processes' jobs.
+        """Yields number and job of those neither done nor failed; waits for those of other processes.
 
-        A job whose process ends before it is finished is taken by another process.
+        If the process that works on a job ends early, another process takes the job over.
         """
         tried: set[int] = set()
         while True:
@@ -199,7 +202,7 @@ class _Bench:
         return self.is_done(job) or self.failure(job) is not None
 
     def failure(self, job: Job) -> str | None:
-        """Why a job failed since this bench began, in any process; None if it did not."""
+        """The reason why a job failed in any process since this benchmark started; None if it did not."""
         file = job.folder / FAILURE_FILE
         try:
             check_regular(file)
@@ -208,12 +211,12 @@ class _Bench:
             return None
 
     def failures(self) -> dict[str, str]:
-        """All jobs that failed, by title."""
+        """The reasons of all failed jobs, by title."""
         found = {job.title: self.failure(job) for job in self.jobs}
         return {title: reason for title, reason in found.items() if reason is not None}
 
     def do(self, job: Job) -> None:
-        """Trains and scores the rest of a job; writes its failure to the run folder."""
+        """Trains and scores a job as far as it is not done; writes the reason of a failure to the run folder."""
         try:
             scene = self._read_scene(job.config)
             train(
@@ -240,7 +243,7 @@ class _Bench:
         scene = self._scene[1]
         if not scene.test_views:
             raise UserError(
-                f"{scene.root} holds out no photo to score: mark some as 'test' in its split .tsv"
+                f"{scene.root} has no held-out photos to score: mark some as 'test' in its split .tsv"
             )
         return scene
 
@@ -277,7 +280,7 @@ class _Bench:
 
     def _remarks(self, scores: Sequence[Score]) -> list[str]:
         reference = reference_preset(self.request.suite)
-        lines = [] if reference == "default" else [f"All lines but other presets: preset {reference}."]
+        lines = [] if reference == "default" else [f"Preset of all rows except other presets: {reference}."]
         for name, _, entries in (variant.partition(":") for variant in self.request.variants):
             lines.append(f"{name}: `{entries}`.")
         return [*lines, *_notes(scores)]
@@ -299,7 +302,7 @@ class _Bench:
 
 
 def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
-    """The scores of a run; None if there are none, or they cannot be read."""
+    """The scores of a run; None if they do not exist or cannot be read."""
     try:
         content = read_json(folder / "eval" / protocol / "metrics.json")
     except (OSError, ValueError):
@@ -308,7 +311,7 @@ def read_metrics(folder: Path, protocol: Protocol) -> dict[str, Any] | None:
 
 
 def _notes(scores: Sequence[Score]) -> list[str]:
-    """The distinct notes of the scores, without the network of LPIPS, which is in the legend."""
+    """The distinct notes of the scores, without the LPIPS network, which the legend names."""
     notes = dict.fromkeys(note for score in scores for note in score.metrics.get("notes", ()))
     lines = [note for note in notes if not note.startswith("LPIPS v0.1")]
     more = len(lines) - MOST_NOTES

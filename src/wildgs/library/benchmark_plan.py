@@ -1,4 +1,4 @@
-"""The runs of a benchmark: methods and variants on scenes, one for each seed."""
+"""Plans the runs of a benchmark: all combinations of scenes, methods or variants, and seeds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ABLATION_LABELS = {"reverse": "w/o {c'}"}
 PHOTOTOURISM_DOWNSCALE = 2
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 _NEXT_ENTRY = re.compile(r",(?=[\w.]+=)")
-_BENCH_ENTRIES = {"scene": "give it as SCENE", "train.seed": "give --seeds"}
+_BENCH_ENTRIES = {"scene": "use the argument SCENES", "train.seed": "use --seeds"}
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class Job:
 
     @property
     def title(self) -> str:
-        """For the console."""
+        """The job's name on the console."""
         return f"{self.scene}, {label_of(self.method)}, seed {self.seed}"
 
 
 def parse_variant(text: str) -> Variant:
-    """Reads ``NAME:KEY=VALUE[,KEY=VALUE...]``; keys are paths in `config.yaml`, values JSON or YAML.
+    """Parses ``NAME:KEY=VALUE[,KEY=VALUE...]``; keys are paths in `config.yaml`, values JSON or YAML.
 
     Raises:
-        UserError: It has another form, or changes what the bench itself sets.
+        UserError: The text has another form, or changes an entry that the benchmark sets.
     """
     name, colon, rest = text.partition(":")
     if not colon or not _NAME.fullmatch(name):
@@ -66,7 +66,7 @@ def parse_variant(text: str) -> Variant:
             f"--variant {text}: expected NAME:KEY=VALUE, for example slow:model.learning_rates.networks=5e-4"
         )
     if name in BENCH_METHODS:
-        raise UserError(f"--variant {text}: {name} is a method of the bench; choose another name")
+        raise UserError(f"--variant {text}: {name} is a method of the benchmark; choose another name")
     entries: dict[str, Any] = {}
     for entry in _NEXT_ENTRY.split(rest):
         key, equals, value = entry.partition("=")
@@ -76,7 +76,7 @@ def parse_variant(text: str) -> Variant:
             )
         if key.strip() in _BENCH_ENTRIES:
             raise UserError(
-                f"--variant {text}: {key.strip()} is not a variant's; {_BENCH_ENTRIES[key.strip()]}"
+                f"--variant {text}: a variant cannot set {key.strip()}; {_BENCH_ENTRIES[key.strip()]}"
             )
         entries[key.strip()] = _plain(value)
     return Variant(name, entries)
@@ -84,7 +84,7 @@ def parse_variant(text: str) -> Variant:
 
 def _plain(text: str) -> Any:
     try:
-        return json.loads(text)  # first, since YAML takes 2e-3 for a word
+        return json.loads(text)  # first, since YAML reads 2e-3 as a string
     except ValueError:
         pass
     try:
@@ -94,27 +94,27 @@ def _plain(text: str) -> Any:
 
 
 def find_phototourism(places: Sequence[Path]) -> tuple[Path, ...]:
-    """The paper's scenes among folders, or one level below them, with a warning for those that are not there.
+    """Finds the paper's scenes among folders or one level below them, and warns of missing ones.
 
     Raises:
-        UserError: None is there, or one lacks its NeRF-W split: the paper's figures stand for those photos only.
+        UserError: None is found, or one has no NeRF-W split, for which the paper's figures hold.
     """
     candidates = [*places, *(place / name for place in places for name in PHOTOTOURISM)]
     found = {path.resolve().name: path for path in reversed(candidates) if path.is_dir()}
     scenes = tuple(found[name] for name in PHOTOTOURISM if name in found)
     missing = ", ".join(name for name in PHOTOTOURISM if name not in found)
-    places_named = ", ".join(map(str, places))
+    searched = ", ".join(map(str, places))
     if not scenes:
-        raise UserError(f"{places_named}: none of the suite's scenes ({missing}) is there")
-    if missing:
-        warnings.warn(
-            f"{places_named}: no {missing}; they are missing from the table", WildGSWarning, stacklevel=2
+        raise UserError(
+            f"{searched}: none of the suite's scenes ({missing}) found; give the folder with them"
         )
+    if missing:
+        warnings.warn(f"{searched}: {missing} not found; the table omits them", WildGSWarning, stacklevel=2)
     for scene in scenes:
         if find_split_file(scene) is None:
             raise UserError(
-                f"{scene}: no split; put NeRF-W's .tsv of this scene into it (without it, the paper's figures "
-                "would stand beside those of other photos)"
+                f"{scene}: no split; put NeRF-W's .tsv of this scene into it, because the paper's figures are for "
+                "the photos of that split"
             )
     return scenes
 
@@ -128,20 +128,20 @@ def make_jobs(
     output: Path,
     reference: PresetName = "default",
 ) -> list[Job]:
-    """All runs, by scene and then by seed, so that the table of the first seed is complete early.
+    """All runs, ordered by scene and seed, so that the table is complete for the first seed early.
 
     Args:
         scenes: Scene folders.
-        base: What all runs share; its scene and seed are replaced.
-        methods: Of the bench.
+        base: Base configuration; its scene and seed are replaced.
+        methods: Members of `BENCH_METHODS`.
         variants: Changes of `base` with the preset `reference`.
-        seeds: One run each.
-        output: The bench's folder; runs go to OUTPUT/<scene>/<method>/seed_<n>.
-        reference: The preset that everything but the presets' own lines is trained with.
+        seeds: Random seeds.
+        output: The benchmark's folder; run folders are OUTPUT/<scene>/<method>/seed_<n>.
+        reference: The preset of all rows except those of other presets.
 
     Raises:
-        UserError: A folder is no scene, names collide, an entry of a variant does not exist, or a run folder
-            holds a run with other settings.
+        UserError: A folder is not a scene, names are not unique, an entry of a variant does not exist, or a run
+            folder contains a run with other settings.
     """
     _check_unique("scene", [scene.resolve().name for scene in scenes])
     _check_unique("--variant", [variant.name for variant in variants])
@@ -166,11 +166,11 @@ def make_jobs(
 def _check_unique(what: str, names: Sequence[str]) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise UserError(f"{what}: {name} is given twice; the table needs different names")
+            raise UserError(f"{what}: {name} is given twice; names must be unique")
 
 
 def label_of(name: str) -> str:
-    """The label of a method in the table; ablations as in the paper's table."""
+    """The label of a method in the table; ablations are labelled as in the paper."""
     if name in METHODS:
         return method_type(name).label
     if name.endswith(HALF):
@@ -184,10 +184,10 @@ def label_of(name: str) -> str:
 
 
 def method_config(method: str, base: RunConfig, reference: PresetName = "default") -> RunConfig:
-    """The configuration of one of `BENCH_METHODS`: `base`, with the preset `reference` but for lines of presets.
+    """The configuration of one of `BENCH_METHODS`: `base` with that preset, or with the preset `reference`.
 
     Raises:
-        UserError: There is no such method.
+        UserError: The method is unknown.
     """
     if method not in BENCH_METHODS and method not in METHODS:
         raise UserError(f"--methods {method}: unknown; choose from {', '.join(BENCH_METHODS)}")
@@ -202,17 +202,17 @@ def method_config(method: str, base: RunConfig, reference: PresetName = "default
 
 
 def _check_stored(job: Job) -> None:
-    """Raises `UserError` if a folder holds a run with other settings."""
+    """Raises `UserError` if the job's folder contains a run with other settings."""
     file = job.folder / CONFIG_FILE
     if not file.is_file():
         return
     differing = differing_entries(read_config(file), job.config)
     budget = differing.get("train.density.max_gaussians")
-    if budget is not None and budget[0] < budget[1]:  # lowered where memory was short
+    if budget is not None and budget[0] < budget[1]:  # lowered because memory was short
         del differing["train.density.max_gaussians"]
     if differing:
-        entry, (stored, asked) = next(iter(differing.items()))
+        entry, (stored, new) = next(iter(differing.items()))
         raise UserError(
-            f"{job.folder} holds a run with other settings ({entry}: {stored} there, {asked} asked for); choose "
-            "another --output or another variant's name"
+            f"{job.folder} holds a run with other settings ({entry} is {stored} instead of {new}); choose another "
+            "--output or another name for the variant"
         )

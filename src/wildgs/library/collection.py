@@ -1,4 +1,4 @@
-"""Records which photos the poses of `wildgs run` were computed from, to detect other photos in the same folder."""
+"""Records the photos and options from which `wildgs run` computed poses, to detect later changes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from wildgs.sfm.upright import list_photos, scene_names
 
 FILE = "collection.json"
 NAMED = 3
-"""Photos that a message names."""
+"""Number of photos that a message names."""
 
 
 @dataclass(frozen=True)
 class PhotoRecord:
-    """Size in bytes, time of the last change in nanoseconds, and SHA-256 of a photo."""
+    """Size in bytes, modification time in nanoseconds, and SHA-256 of a photo."""
 
     size: int
     modified: int
@@ -28,7 +28,7 @@ class PhotoRecord:
 
 @dataclass(frozen=True)
 class Changes:
-    """How a folder of photos differs from the collection that was recorded, by names relative to the folder."""
+    """Differences between a folder of photos and the record, as names relative to the folder."""
 
     added: tuple[str, ...]
     removed: tuple[str, ...]
@@ -47,10 +47,10 @@ class Changes:
 
 
 def photo_files(folder: Path) -> dict[str, Path]:
-    """The photo files below a folder, by relative name.
+    """The photo files in a folder and its sub-folders, by relative name.
 
     Raises:
-        UserError: There is no such folder, or no photo in it.
+        UserError: The folder does not exist or contains no photos.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; give the folder that holds the photos")
@@ -58,10 +58,10 @@ def photo_files(folder: Path) -> dict[str, Path]:
 
 
 def record_collection(photos: Path, scene: Path, sfm: SfmConfig) -> None:
-    """Writes, beside a scene, from which photos and with which options it was made.
+    """Writes into a scene folder from which photos and with which options it was made.
 
     Raises:
-        UserError: A photo cannot be read, or the disk is full.
+        UserError: A photo cannot be read, or the file cannot be written.
     """
     records = {name: asdict(_record(path)) for name, path in photo_files(photos).items()}
     content = {"sfm": _plain(sfm), "photos": records}
@@ -70,20 +70,20 @@ def record_collection(photos: Path, scene: Path, sfm: SfmConfig) -> None:
 
 
 def compare_collection(photos: Path, scene: Path) -> Changes:
-    """How a folder of photos differs from those that a scene was made from.
+    """Compares a folder of photos with those that a scene was made from.
 
-    Contents are read only where size or time differ. Of scenes without a record, names are compared: every photo
-    with a camera must be in the folder.
+    A file is hashed only if its time has changed. For a scene without a record, every photo of the scene must be in
+    the folder by name.
 
     Raises:
-        UserError: There is no such folder, or the record cannot be read.
+        UserError: The folder does not exist, or the record cannot be read.
     """
     present = photo_files(photos)
     stored = _read(scene / FILE)[0]
     if stored is None:
-        known = set(scene_names(list(present)))
-        gone = [name for name in list_photos(scene / "images") if name not in known]
-        return Changes((), tuple(gone), ())
+        names = set(scene_names(list(present)))
+        missing = [name for name in list_photos(scene / "images") if name not in names]
+        return Changes((), tuple(missing), ())
     changed = [name for name, path in present.items() if name in stored and not _same(stored[name], path)]
     return Changes(
         tuple(name for name in present if name not in stored),
@@ -93,7 +93,7 @@ def compare_collection(photos: Path, scene: Path) -> Changes:
 
 
 def changed_options(scene: Path, sfm: SfmConfig) -> str:
-    """Options that are neither the default nor those that a scene was made with, for a message; empty if none.
+    """Describes options that are neither the default nor those a scene was made with; empty if there are none.
 
     Raises:
         UserError: The record cannot be read.
@@ -107,13 +107,13 @@ def changed_options(scene: Path, sfm: SfmConfig) -> str:
 
 
 def _plain(sfm: SfmConfig) -> dict[str, object]:
-    """Options that decide the poses, without nesting."""
+    """Options that affect the poses, without nesting."""
     plain = asdict(sfm)
     return {name: value for name, value in (plain.pop("pairing") | plain).items() if name != "threads"}
 
 
 def _read(file: Path) -> tuple[dict[str, PhotoRecord] | None, dict[str, object]]:
-    """Photos and options; None and nothing where there is no record."""
+    """The recorded photos and options; (None, {}) if there is no record."""
     if not is_there(file):
         return None, {}
     try:
@@ -136,7 +136,7 @@ def _record(path: Path) -> PhotoRecord:
         status = path.stat()
         return PhotoRecord(status.st_size, status.st_mtime_ns, _digest(path))
     except OSError as error:
-        raise UserError(f"{path} cannot be read ({error}); fix its permissions or take it out") from error
+        raise UserError(f"{path} cannot be read ({error}); fix its permissions or remove it") from error
 
 
 def _digest(path: Path) -> str:

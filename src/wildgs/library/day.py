@@ -1,4 +1,4 @@
-"""The day of a run: which photos show it, and a timeline of their lights that changes at an even pace."""
+"""The course of a day: orders the photos of a run, and makes a timeline of their lights at an even pace."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from wildgs.progress import Progress, counter
 from wildgs.scene import View
 
 DAY_FILE = "day.json"
-"""In the run folder: the day that was found, for the checkpoint of which it was found."""
+"""Caches the day in the run folder; valid for one checkpoint."""
 
 _SAMPLES = 4
-"""Pictures between two keys by which the pace is measured."""
+"""Images between two key frames from which the pace is measured."""
 
 _SIDE = 160
 
 
 @torch.no_grad()
 def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progress | None = None) -> Day:
-    """The photos of a run in the order of a day; kept in the run folder.
+    """Orders the photos of a run by the time of day; the result is cached in the run folder.
 
-    Photos that fit no light (`LoadedScene.misfits`) are not part of it.
+    Misfits (`LoadedScene.misfits`) are left out.
 
     Args:
         loaded: The run.
-        photos: Folder of the original photos, whose EXIF blocks have times; None takes the scene folder of the run.
+        photos: Folder of the original photos with EXIF times; None takes the scene folder of the run.
         progress: Called for every photo.
 
     Raises:
-        UserError: The run has one light only, or too few photos; there is no folder `photos`.
+        UserError: The run cannot be relit or has too few photos, or the folder `photos` does not exist.
     """
     captures = read_captures(loaded, photos)
     kept, timed = loaded.run.folder / DAY_FILE, _digest(captures)
@@ -59,7 +59,7 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
     views = _usable_views(loaded)
     if len(views) < LEAST_PHOTOS:
         raise UserError(
-            f"{loaded.run.folder}: a day needs a run whose light changes, with at least {LEAST_PHOTOS} photos"
+            f"{loaded.run.folder}: --over day needs a run that can be relit, with at least {LEAST_PHOTOS} photos"
         )
     places = [capture.place for capture in captures.values() if capture.place is not None]
     place = tuple(np.median(places, axis=0).tolist()) if places else None
@@ -70,13 +70,13 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
         with written_aside(kept) as aside:
             content = {"step": loaded.run.step, "timed": timed, **asdict(day)}
             aside.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    except UserError:  # a run on a read-only disk can still be shown
+    except UserError:  # a run on a read-only disk works without the cache
         pass
     return day
 
 
 def _comparable(captures: dict[str, Capture], place: tuple | None) -> dict[str, Capture]:
-    """Captures whose phases follow the same clock: the sun's for all that allow it, if those are most."""
+    """Captures on one clock: those with a solar time if they are the majority, else all by local time."""
     solar = {name: each for name, each in captures.items() if each.utc is not None and (each.place or place)}
     return (
         solar
@@ -95,7 +95,7 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
 
 
 def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
-    method, show = loaded.run.method, counter(progress, "looking at the light of photos")
+    method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
     found = {}
     for number, view in enumerate(views, start=1):
@@ -109,7 +109,7 @@ def _digest(captures: dict[str, Capture]) -> str:
 
 
 def _read(file: Path, loaded: LoadedScene, timed: str | None = None) -> Day | None:
-    """What was found before for the same checkpoint and, unless None, the same times; None if it is damaged."""
+    """Reads the cached day; None if it is damaged or outdated (another checkpoint, or other times than `timed`)."""
     try:
         content = read_json(file)
         found_step, found_timed = content.pop("step"), content.pop("timed")
@@ -123,30 +123,30 @@ def _read(file: Path, loaded: LoadedScene, timed: str | None = None) -> Day | No
 
 
 def viewpoints_of(views: Sequence[View]) -> torch.Tensor:
-    """Camera centres, evenly chosen where there are many."""
+    """Camera centres of the views, or an even selection of about 64."""
     chosen = views[:: max(1, -(-len(views) // 64))]
     return torch.stack([view.camera.position for view in chosen]) if chosen else torch.zeros(0, 3)
 
 
 def has_day(loaded: LoadedScene) -> bool:
-    """Whether a run's light changes, and it has photos enough for a day."""
+    """Whether a run can be relit and has enough photos for `find_day`."""
     return len(_usable_views(loaded)) >= LEAST_PHOTOS
 
 
 def known_day(loaded: LoadedScene) -> Day | None:
-    """The day that was found for the run before, if one was."""
+    """The cached day of a run, if there is one."""
     return _read(loaded.run.folder / DAY_FILE, loaded)
 
 
 def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:
-    """Whether these are several photos in the order of the day that was found for the run."""
+    """Whether these are at least two photos in the order of the run's cached day."""
     day = known_day(loaded)
-    known = [day.phases[name] for name in names if name in day.phases] if day else []
-    return len(known) == len(names) > 1 and known == sorted(known)
+    phases = [day.phases[name] for name in names if name in day.phases] if day else []
+    return len(phases) == len(names) > 1 and phases == sorted(phases)
 
 
 def start_view(loaded: LoadedScene) -> View:
-    """The photo from which the landmark is seen whole and large."""
+    """The photo that shows the scene complete and large."""
     views = loaded.scene.train_views or loaded.views
     return views[choose_start([view.camera for view in views], loaded.scene.points)[0]]
 
@@ -154,13 +154,13 @@ def start_view(loaded: LoadedScene) -> View:
 def day_timeline(
     loaded: LoadedScene, day: Day, camera: Camera | None = None, *, progress: Progress | None = None
 ) -> Timeline:
-    """The lights of a day, at a pace at which the picture changes evenly.
+    """A timeline through the lights of a day, paced so that the rendered image changes evenly.
 
     Args:
         loaded: The run.
         day: From `find_day`.
-        camera: Where the picture is looked at; None takes `start_view`.
-        progress: Called for every picture.
+        camera: Camera for measuring the changes; None takes `start_view`.
+        progress: Called for every rendered image.
     """
     looks = tuple(loaded.appearance(name) for name in day.keys)
     timeline = Timeline(looks)

@@ -1,4 +1,4 @@
-"""`wildgs.examine`: what works on this machine; and the report for a bug, without names of people and machines."""
+"""`wildgs.examine`: checks what works on this machine; and the text for bug reports, without personal names."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Check:
     Attributes:
         name: What was checked.
         state: `missing` can be installed; `broken` is installed and fails.
-        detail: What was found, or why it does not work and what is lost.
+        detail: The version found, or why it does not work and what is not available without it.
         remedy: The command that installs or repairs it, if there is one.
     """
 
@@ -41,7 +41,7 @@ class Check:
 
 
 def examine() -> list[Check]:
-    """All checks, each guarded: one that raises is reported as broken."""
+    """Runs all checks; one that raises an exception is reported as broken."""
     probes: list[tuple[str, Callable[[], Check]]] = [
         ("Python", _python),
         ("PyTorch", _torch),
@@ -60,7 +60,7 @@ def examine() -> list[Check]:
     for name, probe in probes:
         try:
             checks.append(probe())
-        except Exception as error:  # the doctor reports what fails, of whatever kind
+        except Exception as error:  # any failure is a finding
             first = (str(error).splitlines() or [""])[0]
             checks.append(Check(name, "broken", f"{type(error).__name__}: {first}"))
     return checks
@@ -99,7 +99,7 @@ def _cpu_model() -> str:
 
 
 def _numba() -> Check:
-    """Compiles and runs a kernel, and compares."""
+    """Compiles and runs a kernel and checks its result."""
     import numba
     import torch
 
@@ -109,9 +109,9 @@ def _numba() -> Check:
     picture = torch.linspace(0, 1, 16 * 16 * 3).view(16, 16, 3)
     value = float(ssim(picture, picture))
     if abs(value - 1) > 1e-4:
-        detail = f"{numba.__version__} computes {value} where 1 is right"
+        detail = f"{numba.__version__} computes {value} instead of 1"
         return Check("Numba", "broken", detail, _pip("numba", "-U"))
-    cores = f"kernels run on {thread_count()} threads (WILDGS_NUM_THREADS sets another number)"
+    cores = f"kernels run on {thread_count()} threads (change with WILDGS_NUM_THREADS)"
     return Check("Numba", "works", f"{numba.__version__}, {cores}")
 
 
@@ -120,16 +120,16 @@ def _cuda_rasterizer() -> Check:
 
     name = "rasteriser on CUDA"
     if not torch.cuda.is_available():
-        detail = "torch sees no NVIDIA GPU; everything runs on the CPU, only slower"
+        detail = "torch finds no NVIDIA GPU; everything runs on the CPU, but slower"
         if torch.version.cuda is None and shutil.which("nvidia-smi"):
-            detail = "this build of torch has no CUDA, though the machine has an NVIDIA driver"
+            detail = "this build of torch has no CUDA, but the machine has an NVIDIA driver"
             return Check(name, "missing", detail, _pip("torch", "-U --force-reinstall"))
         return Check(name, "missing", detail)
     return _gsplat(name)
 
 
 def _gsplat(name: str) -> Check:
-    """Whether gsplat fits, and whether its CUDA extension is built or can be; builds nothing."""
+    """Checks gsplat's version and whether its CUDA extension is built or can be built; builds nothing."""
     from wildgs.errors import UserError
     from wildgs.rasterize import gsplat_library
 
@@ -148,7 +148,7 @@ def _gsplat(name: str) -> Check:
 
 
 def build_gsplat() -> None:
-    """Builds gsplat's CUDA extension unless it is built; raises `UserError` where it cannot be built."""
+    """Builds gsplat's CUDA extension if necessary; raises `UserError` if that fails."""
     from wildgs.errors import UserError
     from wildgs.rasterize import gsplat_library
 
@@ -160,7 +160,7 @@ def build_gsplat() -> None:
 
 
 def _rasterize_one(name: str, device: str) -> Check:
-    """Renders one Gaussian in the middle of a picture and looks at it."""
+    """Renders one Gaussian and checks the image."""
     import torch
 
     from wildgs.geometry.camera import Camera
@@ -174,8 +174,8 @@ def _rasterize_one(name: str, device: str) -> Check:
     projection = project(means, quats, 0.2 * ones, 0.9 * ones[:, 0], camera)
     alpha = float(blend(projection, ones).alpha[16, 16])
     if not 0.85 < alpha < 0.95:
-        return Check(name, "broken", f"a Gaussian of opacity 0.9 comes out as {alpha:.2f}")
-    return Check(name, "works", "rendered a test picture")
+        return Check(name, "broken", f"a Gaussian of opacity 0.9 is rendered with alpha {alpha:.2f}")
+    return Check(name, "works", "rendered a test image")
 
 
 def _pycolmap() -> Check:
@@ -194,18 +194,16 @@ def _encoder_weights() -> Check:
 
 
 def _depth_weights() -> Check:
-    """Whether the network is in the Hugging Face cache; the hub is not asked."""
+    """Checks whether the network is in the Hugging Face cache, without a network request."""
     from huggingface_hub import try_to_load_from_cache
 
     from wildgs.priors.config import DEPTH_ANYTHING
 
     name = "depth weights"
-    # Other files of weights are pickles, which can run code.
+    # Only safetensors: weights in pickle files could execute code.
     if isinstance(try_to_load_from_cache(DEPTH_ANYTHING, "model.safetensors"), str):
         return Check(name, "works", f"{DEPTH_ANYTHING} is cached")
-    detail = (
-        f"{DEPTH_ANYTHING} is not cached; it is downloaded when first needed, or else there is no depth loss"
-    )
+    detail = f"{DEPTH_ANYTHING} is not cached; it is downloaded at its first use; without it there is no depth loss"
     return Check(name, "missing", detail, f"hf download {DEPTH_ANYTHING}")
 
 
@@ -266,7 +264,7 @@ def write_report(checks: Sequence[tuple[str, str, str]], run: Path | None) -> st
 
 
 def without_names(text: str) -> str:
-    """The text without the user's home folder, the user's and the machine's name."""
+    """Removes the path of the home folder and the names of the user and the machine from a text."""
     home = str(Path.home())
     if len(home) > 1:
         text = text.replace(home, "~")
@@ -280,7 +278,7 @@ def without_names(text: str) -> str:
 def _user() -> str:
     try:
         return getpass.getuser()
-    except Exception:  # a user without an entry in the system's list
+    except Exception:  # a user without an entry in the password database
         return ""
 
 
@@ -295,7 +293,7 @@ def _versions() -> list[str]:
 
 
 def _tail(path: Path, count: int) -> str:
-    """The last lines of a file, however long it is."""
+    """The last lines of a file; reads at most its last `LOG_BYTES`."""
     try:
         check_regular(path)
         with path.open("rb") as file:

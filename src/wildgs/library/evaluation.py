@@ -1,4 +1,4 @@
-"""`wildgs.evaluate`: scores of a run on the photos that were held out."""
+"""`wildgs.evaluate`: scores a run on its held-out photos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from wildgs.scene import Scene
 PROTOCOLS: tuple[Protocol, ...] = ("full", "half")
 
 Scores = dict[Protocol, dict[str, Any]]
-"""By protocol, what its `metrics.json` holds."""
+"""The content of `metrics.json` of each protocol."""
 
 
 def evaluate(
@@ -28,21 +28,21 @@ def evaluate(
     lpips: str | Path | None = None,
     progress: Progress | None = None,
 ) -> Scores:
-    """Scores a run's held-out views and writes pictures and `metrics.json` to RUN/eval/.
+    """Scores a run on its held-out photos and writes images and `metrics.json` to RUN/eval/.
 
     Args:
-        run: A run folder, or a run loaded from one.
-        protocols: `full` takes a view's light from the whole photo and scores the whole frame; `half` takes it from
-            the left half and scores the right one.
-        scene: The scene folder, where it moved since training, or the scene read from it.
-        lpips: Folder with other LPIPS weights (AlexNet's, say) than the package's SqueezeNet.
+        run: A run folder, or a loaded run or scene.
+        protocols: `full` embeds the whole photo and scores the whole image; `half` embeds the left half of the
+            photo and scores the right half.
+        scene: The scene, or its folder if it has moved since training.
+        lpips: Folder with other LPIPS weights, for example AlexNet's, than the package's SqueezeNet.
         progress: Called for every photo read and every view scored.
 
     Raises:
-        UserError: There is no such run or folder, the photos are gone, or none is held out.
+        UserError: The run or a folder does not exist, the scene's photos are missing, or none is held out.
     """
     check_lpips(lpips)
-    loaded = opened(run)
+    loaded = open_run(run)
     if not isinstance(scene, Scene):
         scene = read_run_scene(loaded, scene, progress)
     scores: Scores = {}
@@ -66,27 +66,27 @@ def evaluate(
 
 
 def check_lpips(folder: str | Path | None) -> None:
-    """Raises `UserError` if a folder of LPIPS weights was asked for and is not there."""
+    """Raises `UserError` if the folder of LPIPS weights does not exist."""
     if folder is not None and not Path(folder).is_dir():
-        raise UserError(f"--lpips {folder}: no such folder; leave it out for the weights of the package")
+        raise UserError(f"--lpips {folder}: no such folder; leave it out to use the package's weights")
 
 
 def read_run_scene(run: Run, root: str | Path | None = None, progress: Progress | None = None) -> Scene:
-    """The scene on which a run was trained, with its photos at full size.
+    """Reads the scene on which a run was trained, with its photos at the size used in training.
 
     Args:
         run: The run.
-        root: The scene folder, where it is not where it was.
+        root: The scene folder, if it has moved.
         progress: Called for every photo read.
 
     Raises:
-        UserError: The scene cannot be read, or is another one.
+        UserError: The scene cannot be read, or is not that of the run.
     """
     return run.read_scene(None if root is None else Path(root), counter(progress, "reading photos"))
 
 
-def opened(run: str | Path | Run | LoadedScene) -> Run:
-    """The run that a user means by a folder or a loaded scene."""
+def open_run(run: str | Path | Run | LoadedScene) -> Run:
+    """The run itself, that of a loaded scene, or that loaded from a folder."""
     if isinstance(run, LoadedScene):
         return run.run
     return run if isinstance(run, Run) else load_run(Path(run))

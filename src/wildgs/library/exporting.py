@@ -1,4 +1,4 @@
-"""`wildgs.export`: files for other programs, and the web page that carries the light."""
+"""`wildgs.export`: writes files for other programs, or a relightable web page."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COMPARED_VIEWS = 4
 
 @dataclass(frozen=True)
 class _Request:
-    """What every file of one export has in common."""
+    """Options that all files of one export share."""
 
     scene: LoadedScene
     output: Path
@@ -58,24 +58,24 @@ def export(
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> list[ExportedFile]:
-    """Writes a run as files for other programs: html, glb and usd hold all appearances, the others one each.
+    """Exports a run to files: html, glb and usd with all appearances in one file, other formats with one each.
 
     Args:
         run: A run folder, or a loaded scene.
-        formats: One or several of `ExportFormat`.
-        appearance: What `LoadedScene.appearance` takes. By default html, glb and usd take photos as
-            different as the scene has them, and other files are neutral.
-        output: Folder for the files, by default RUN/export; with one file to write, it may be the file itself.
-        title: The page's headline; by default the run folder's name.
-        aligned: Keep the frame of training (+z up, the photos' median depth is 1) instead of the input's.
-        cleanup: What to leave out. Unless it sets a degree, .ply files have all 45 coefficients above degree 0,
-            zeros where the run has none.
-        spz_version: 4, or 3 for programs that do not know 4 yet.
-        mixing: How appearances are found and mixed.
+        formats: One or more of `ExportFormat`.
+        appearance: Anything that `LoadedScene.appearance` accepts. Default: several photos of very different light
+            for html, glb and usd; neutral for the others.
+        output: Folder for the files, or the file itself if only one is written. Default: RUN/export.
+        title: Title of the web page. Default: the run folder's name.
+        aligned: Use the frame of training (+z up, median depth of the photos = 1) instead of the COLMAP model's.
+        cleanup: What to drop. Unless it sets a degree, .ply files have all 45 coefficients above degree 0, padded
+            with zeros.
+        spz_version: 4, or 3 for programs that do not support 4 yet.
+        mixing: How appearances are obtained and mixed.
         progress: Called during long work.
 
     Raises:
-        UserError: An appearance cannot be had, nothing is left to write, or a file cannot be written.
+        UserError: An appearance cannot be obtained, no Gaussian is left, or a file cannot be written.
     """
     formats = [formats] if isinstance(formats, str) else list(formats)
     kinds: list[SplatFormat] = [kind for kind in formats if kind not in ("html", "glb", "usd")]
@@ -109,7 +109,7 @@ def export(
 def _files(
     request: _Request, looks: list[Look], kinds: list[SplatFormat], *, alone: bool
 ) -> dict[tuple[Look, SplatFormat], Path]:
-    """Where each look goes in each format; no two files share a name."""
+    """The file of each look in each format; all names are unique."""
     folder = request.output
     if len(looks) * len(kinds) == 1 and alone and folder.name.endswith(f".{kinds[0]}"):
         return {(looks[0], kinds[0]): folder}
@@ -124,7 +124,7 @@ def _files(
 
 
 def _file_of_all(request: _Request, name: str, alone: bool) -> Path:
-    """Where a file with all lights goes."""
+    """The path of a file with all lights."""
     output = request.output
     return output if alone and output.suffix == Path(name).suffix else output / name
 
@@ -137,7 +137,7 @@ def _write_page(request: _Request, looks: Sequence[Look], file: Path) -> Exporte
 
 @torch.no_grad()
 def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> ExportedFile:
-    """All lights in one .glb or .usd file."""
+    """Writes all lights to one .glb or .usd file."""
     loaded, collection = request.scene, request.scene.scene
     viewpoints = viewpoints_of(collection.views)
     motion = upright(loaded.run.alignment, aligned=request.aligned)
@@ -173,7 +173,7 @@ def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> 
 
 
 def _to_colmap(motion: Alignment, alignment: Alignment) -> Alignment:
-    """From a file's frame to the input's, by way of the aligned frame."""
+    """The transform from a file's frame to the COLMAP model's, through the aligned frame."""
     into, back = motion.inverse(), alignment.inverse()
     return Alignment(
         back.rotation @ into.rotation, back.apply_points(into.translation), back.scale * into.scale
@@ -183,7 +183,7 @@ def _to_colmap(motion: Alignment, alignment: Alignment) -> Alignment:
 def _report_shared(
     request: _Request, splats: Sequence[Splats], harmonics: SharedHarmonics, motion: Alignment
 ) -> None:
-    """Logs what sharing harmonics between the lights costs."""
+    """Logs the loss in quality from sharing harmonics between the lights."""
     if harmonics.all_own:
         return
     collection = request.scene.scene
@@ -195,14 +195,14 @@ def _report_shared(
         agreement(each, each.with_sh(harmonics.whole(number)), cameras) for number, each in enumerate(splats)
     ]
     logger.info(
-        f"{len(splats)} lights share harmonics above degree 0, but for {request.cleanup.own_harmonics:.0%} of the "
-        f"Gaussians: {min(same):.1f} to {max(same):.1f} dB PSNR against all of them, over {len(cameras)} views "
-        "(--own-harmonics 1 shares nothing)"
+        f"{len(splats)} lights share harmonics above degree 0, except for {request.cleanup.own_harmonics:.0%} of "
+        f"the Gaussians: {min(same):.1f} to {max(same):.1f} dB PSNR against separate harmonics, over "
+        f"{len(cameras)} views (--own-harmonics 1 keeps all separate)"
     )
 
 
 def _write_look(request: _Request, look: Look, files: dict[SplatFormat, Path]) -> list[ExportedFile]:
-    """One look in every format, cleaned up once."""
+    """Writes one look in every format."""
     splats = _cleaned(request, look)
     placed = splats if request.aligned else splats.to_input_frame(request.scene.run.alignment)
     written = []
@@ -216,18 +216,18 @@ def _write_look(request: _Request, look: Look, files: dict[SplatFormat, Path]) -
 
 
 def _cleaned(request: _Request, look: Look) -> Splats:
-    """What stays of a look's Gaussians; logs how many those are, and what that costs."""
+    """The Gaussians of a look that remain after clean-up; logs their number and the loss in quality."""
     whole, scene = baked(request.scene, look), request.scene.scene
     splats = clean(request.cleanup, whole, scene.points, viewpoints_of(scene.views))
     if not len(splats):
         raise UserError(
-            "these options leave no Gaussian; lower --min-opacity, or raise --crop or --max-distance"
+            "these options drop all Gaussians; lower --min-opacity, or raise --crop or --max-distance"
         )
     if request.cleanup.active:
         views = (scene.test_views or scene.views)[:COMPARED_VIEWS]
         same = agreement(whole, splats, [view.camera for view in views])
         logger.info(
-            f"{look.name}: {len(splats):,} of {len(whole):,} Gaussians stay, harmonics of degree "
-            f"{splats.sh_degree}; {same:.1f} dB PSNR against all of them, over {len(views)} views"
+            f"{look.name}: kept {len(splats):,} of {len(whole):,} Gaussians, harmonics of degree "
+            f"{splats.sh_degree}; {same:.1f} dB PSNR against all Gaussians, over {len(views)} views"
         )
     return splats

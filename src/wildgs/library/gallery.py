@@ -1,4 +1,4 @@
-"""`wildgs.gallery`: views times appearances on one contact sheet."""
+"""`wildgs.gallery`: renders a grid of views and appearances as one contact sheet."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class WrittenGallery:
     """A written gallery.
 
     Attributes:
-        sheet: The picture with all tiles.
-        tiles: Folder of the single tiles, <appearance>/<view>.png; None where only the sheet was asked for.
-        views: Names of the rows' photos.
+        sheet: The image with all tiles.
+        tiles: Folder of the single tiles, <appearance>/<view>.png; None if `output` was an image file.
+        views: Names of the photos of the rows.
         looks: Appearances of the columns.
     """
 
@@ -56,14 +56,14 @@ def gallery(
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> WrittenGallery:
-    """Renders a grid of views (rows) and appearances (columns) as one picture.
+    """Renders a grid of views (rows) and appearances (columns) as one image.
 
     Args:
         run: A run folder, or a loaded scene.
-        output: A picture (.jpg, .png), or a folder for gallery.jpg and every tile; by default RUN/gallery.
-        views: Photos whose viewpoint is rendered; by default a few that were held out.
-        appearance: What `LoadedScene.appearance` takes; by default the mean and a few photos.
-        mixing: How appearances are found and mixed.
+        output: An image file (.jpg, .png), or a folder for gallery.jpg and every tile. Default: RUN/gallery.
+        views: Names of the photos whose viewpoints are rendered. Default: a few held-out photos.
+        appearance: Anything that `LoadedScene.appearance` accepts. Default: neutral and a few photos.
+        mixing: How appearances are obtained and mixed.
         progress: Called for every tile.
 
     Raises:
@@ -84,7 +84,7 @@ def gallery(
         [view.read_photo().numpy(), *tiles[number * len(looks) :][: len(looks)]]
         for number, view in enumerate(rows)
     ]
-    # A mix of several photos has no photo of its own to show above it.
+    # A mix of several photos has no single photo to show above its column.
     sources = [_source(scene.scene, spec) for spec in specs] if len(looks) == len(specs) else []
     if any(source is not None for source in sources):
         grid.insert(0, [None, *sources])
@@ -98,14 +98,14 @@ def gallery(
 
 
 def _default_lights(scene: LoadedScene) -> list[str]:
-    """The mean light and a few photos as different as the collection has them."""
+    """Neutral, and a few photos of very different light."""
     if not scene.relightable:
         return [NEUTRAL]
     return [NEUTRAL, *(view.name for view in different_lights(scene.scene.train_views, LIGHTS))]
 
 
 def _source(scene: Scene, spec: str) -> np.ndarray | None:
-    """The picture from which an appearance is taken, if there is one."""
+    """The image of which an appearance is the embedding, if there is one."""
     view = match_view(scene.views, spec)
     if view is not None:
         return view.read_photo().numpy()
@@ -116,7 +116,7 @@ def _source(scene: Scene, spec: str) -> np.ndarray | None:
 
 
 def fit(picture: Picture, width: int, height: int) -> Image.Image:
-    """Fits a picture into a tile, padded where its aspect ratio differs."""
+    """Fits an image into a tile and pads it if the aspect ratio differs."""
     image = Image.fromarray(picture)
     scale = min(width / image.width, height / image.height)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
@@ -133,12 +133,12 @@ def contact_sheet(
     *,
     tile: tuple[int, int],
 ) -> Image.Image:
-    """Pictures in rows and columns, with a caption above each column.
+    """Arranges images in rows and columns, with a caption above each column.
 
     Args:
-        rows: Pictures, None for an empty tile; all rows of one length.
+        rows: Images, None for an empty tile; all rows have the same length.
         captions: Captions of the columns.
-        tile: Width and height of a tile in pixels; the aspect ratio of pictures is kept.
+        tile: Width and height of a tile in pixels; images keep their aspect ratio.
     """
     width, height = tile
     letters = max(10, round(height * 0.075))

@@ -31,11 +31,11 @@ from wildgs.scene import Scene, View
 from wildgs.scene.trajectories import make_path
 
 FEATURE_INDEX_FILE = "feature_index.safetensors"
-"""In the run folder: what new photos are localised against, made when the first one comes."""
+"""Feature index in the run folder, created when the first new photo is localised."""
 
 
 class LoadedScene:
-    """A trained run, ready to be looked at.
+    """A trained run, ready for rendering.
 
     Attributes:
         run: The run: its configuration, trained method and alignment.
@@ -47,7 +47,7 @@ class LoadedScene:
 
     @property
     def scene(self) -> Scene:
-        """The photo collection as the run folder carries it, see `Run.scene`; photos are decoded as needed."""
+        """The photo collection as stored in the run folder (`Run.scene`); photos are decoded on demand."""
         return self.run.scene
 
     @property
@@ -57,59 +57,59 @@ class LoadedScene:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The Gaussians, in the scene's aligned frame (+z up, the photos' usual depth is 1)."""
+        """The Gaussians, in the aligned frame (+z up, median depth of the photos = 1)."""
         return self.run.method.gaussians
 
     @property
     def relightable(self) -> bool:
-        """Whether photos have a say in the colours; plain 3DGS has one light only."""
+        """Whether colours depend on an appearance; False for plain 3DGS."""
         return self.run.method.relightable
 
     def appearance(
         self, spec: str | Path | Look, *, like: str | None = None, progress: Progress | None = None
     ) -> Look:
-        """The light of a photo or anything else that can lend one.
+        """The appearance of a photo or another source.
 
-        A run of plain 3DGS has one look, its own, which every call gives.
+        Plain 3DGS cannot be relit: every call returns its only look.
 
         Args:
-            spec: A photo of the scene by name (with or without its ending); the path of a new photo of the place;
-                the path of any picture; `"neutral"` for the mean over the training photos; the path of a saved
-                appearance (`*.safetensors`); or a look, which is given back.
-            like: For a file: the photo of the scene whose camera and depth it borrows, or `"auto"` for the
-                training photo that looks most like it.
-            progress: Called with (what is being done, how much of it is done, of how much) during long work.
+            spec: Name of a photo of the scene (with or without extension); path of a new photo of the scene or of
+                any other image; `"neutral"` for the mean over the training photos; path of a saved appearance
+                (`*.safetensors`); or a look, which is returned unchanged.
+            like: For an image file: the photo of the scene whose camera and depth are used, or `"auto"` for the
+                most similar training photo.
+            progress: Called during long work.
 
         Raises:
-            UserError: There is no such photo or file, or it cannot be used.
+            UserError: The photo or file does not exist or cannot be used.
         """
         return spec if isinstance(spec, Look) else self._sources.find(spec, like=like, progress=progress)
 
     @torch.no_grad()
     def render(self, camera: Camera, look: Look) -> UInt8[Tensor, "H W 3"]:
-        """A picture, in main memory; plain 3D Gaussian Splatting once the look is shaded.
+        """Renders an image, returned on the CPU.
 
         Args:
-            camera: In the scene's aligned frame, as `views` have theirs.
-            look: From `appearance` or `mix`.
+            camera: A camera in the aligned frame, like those of `views`.
+            look: From `appearance` or `mix`. Its first use computes all colours; further renders are plain 3DGS.
 
         Raises:
             UserError: The look belongs to another run.
         """
         method = self.run.method
         if look.method is not method:
-            raise UserError(f"the appearance {look.name!r} belongs to another run; get it from this one")
+            raise UserError(f"the appearance {look.name!r} belongs to another run; obtain it from this one")
         return to_8bit(method.render(camera, look.sh, depth=False).colors).cpu()
 
     def frames(
         self, cameras: Sequence[Camera], looks: Look | Sequence[Look] | Timeline
     ) -> Iterator[UInt8[Tensor, "H W 3"]]:
-        """Pictures along a trajectory, rendered as they are asked for.
+        """Renders images along a trajectory, one at a time.
 
         Args:
-            cameras: From `path`, or any others in the scene's aligned frame.
-            looks: One, or several between which the light changes evenly from the first frame to the last, or a
-                timeline.
+            cameras: From `path`, or any others in the aligned frame.
+            looks: One look; or several, between which the light changes evenly from the first frame to the last; or
+                a timeline.
         """
         timeline = Timeline.of(looks)
         last = max(len(cameras) - 1, 1)
@@ -124,28 +124,29 @@ class LoadedScene:
         size: tuple[int, int] | None = None,
         views: Sequence[str] = (),
     ) -> list[Camera]:
-        """Cameras of a video, in the scene's aligned frame.
+        """Cameras along a path, in the aligned frame.
 
         Args:
-            kind: `orbit`, `training` (past the places of the photos), `spiral`, `views` (through the photos named),
-                `still` (the photo named), or the path of a camera file (docs/cameras.md; also nerfstudio's).
-            frames: How many; a camera file has its own number.
-            size: Width and height of the pictures; None takes the photos' usual size, or the photo's or file's.
+            kind: `orbit`, `training` (along the camera positions of the photos), `spiral`, `views` (through the
+                photos in `views`), `still` (at the photo in `views`), or a camera file (docs/cameras.md; also
+                nerfstudio's).
+            frames: Number of cameras; a camera file has its own.
+            size: Width and height in pixels; None takes that of the file, the still's photo, or the typical photo.
             views: Names of photos, for `views` and `still`.
 
         Raises:
-            UserError: There is no such path or photo, or the file cannot be read.
+            UserError: The path or a photo does not exist, or the file cannot be read.
         """
         return make_path(self.scene, kind, frames=frames, size=size, views=views)
 
     def photo_fits(self, *, scene: Scene | None = None, progress: Progress | None = None) -> list[PhotoFit]:
-        """How well each training photo fits, and how much of it its mask hides.
+        """How well each training photo fits its render, and how much of it the mask hides.
 
-        Training keeps this in RUN/photos.json at its end; photos of a run without the file are inspected now.
+        Training writes this to RUN/photos.json; if the file is missing, it is computed.
 
         Args:
-            scene: With the photos; None takes what the run folder carries.
-            progress: Called for every photo inspected.
+            scene: The scene with its photos; None takes the copies in the run folder.
+            progress: Called for every photo.
         """
         photos = read_photos(self.run.folder, self.run.step)
         if photos is None:
@@ -155,36 +156,36 @@ class LoadedScene:
         return photos
 
     def misfits(self) -> list[PhotoFit]:
-        """Training photos that fit no light, worst first: collages, drawings, other places, wrong poses."""
+        """Training photos that no appearance explains (collages, drawings, wrong poses), worst first."""
         return find_misfits(self.photo_fits())
 
     @torch.no_grad()
     def depth(self, camera: Camera) -> Float[Tensor, "H W"]:
-        """Expected depth along the camera's z axis, world units, in main memory; 0 where nothing is."""
+        """Expected depth along the camera's z axis in units of the aligned frame, on the CPU; 0 where empty."""
         projection = self.gaussians.project(camera.to(self.gaussians.means.device))
         return blend(projection, None).depth.cpu()
 
 
 def load(run: str | Path, device: torch.device | str | None = None) -> LoadedScene:
-    """Opens a trained run.
+    """Loads a trained run.
 
     Args:
         run: The run folder.
-        device: Where to render; None takes CUDA where torch has it.
+        device: Device for rendering. Default: CUDA if available, else the CPU.
 
     Raises:
-        UserError: The folder holds no run, or no checkpoint yet.
+        UserError: The folder is not a run folder, or has no checkpoint yet.
     """
     return LoadedScene(load_run(Path(run), None if device is None else torch.device(device)))
 
 
 @dataclass(frozen=True)
 class SavedAppearance:
-    """A written appearance.
+    """A saved appearance.
 
     Attributes:
-        file: Where it was written.
-        look: What it holds.
+        file: The file.
+        look: The appearance in it.
     """
 
     file: Path
@@ -199,30 +200,30 @@ def appearance(
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> SavedAppearance:
-    """Saves the light of a photo, or a mix of several, as a small file that holds no code (safetensors).
+    """Saves the appearance of a photo, or a mix of several, as a small safetensors file.
 
     Args:
-        run: A run folder, or a loaded scene. The file belongs to the run at its present step.
-        photos: What `LoadedScene.appearance` takes; several with weights.
-        output: File to write, ending in .safetensors.
-        mixing: How several photos become one appearance.
+        run: A run folder, or a loaded scene. The file is valid for this run at its current step.
+        photos: Anything that `LoadedScene.appearance` accepts; several with weights.
+        output: File to write (.safetensors).
+        mixing: How several photos are mixed into one appearance.
         progress: Called during long work.
 
     Raises:
-        UserError: An appearance cannot be had, there is more than one, or the file cannot be written.
+        UserError: An appearance cannot be obtained, there is more than one, or the file cannot be written.
     """
     scene = loaded(run)
     specs = [photos] if isinstance(photos, (str, Path)) else photos
     looks = find_looks(scene, specs, mixing, progress=progress)
     if len(looks) != 1:
         raise UserError(
-            f"{len(looks)} appearances do not go into one file; give one, or mix them by --weights"
+            f"{len(looks)} appearances do not fit into one file; give one, or mix them by --weights"
         )
     return SavedAppearance(save_look(looks[0], Path(output)), looks[0])
 
 
 def loaded(run: str | Path | LoadedScene) -> LoadedScene:
-    """The loaded scene that a user means by a run folder or by itself."""
+    """The scene itself, or that loaded from a run folder."""
     return run if isinstance(run, LoadedScene) else load(run)
 
 
@@ -233,16 +234,16 @@ def find_looks(
     *,
     progress: Progress | None = None,
 ) -> list[Look]:
-    """The looks of some appearances: one for each, or a single mixed one.
+    """Obtains one look for each spec, or a single mixed one.
 
     Args:
         scene: The loaded scene.
-        specs: What `LoadedScene.appearance` takes.
-        mixing: How they are found and mixed.
+        specs: Anything that `LoadedScene.appearance` accepts.
+        mixing: How they are obtained and mixed.
         progress: Called during long work.
 
     Raises:
-        UserError: An appearance cannot be had, or the options contradict each other.
+        UserError: An appearance cannot be obtained, or the options contradict each other.
     """
     mixing = mixing or MixOptions()
 
@@ -250,10 +251,10 @@ def find_looks(
         return scene.appearance(spec, like=mixing.like, progress=progress)
 
     parts = (mixing.global_, mixing.local)
-    if None not in parts:  # both parts come from elsewhere
+    if None not in parts:
         if mixing.weights or tuple(specs) not in ((), (NEUTRAL,)):
             raise UserError(
-                "--global and --local make the whole appearance; leave --appearance and --weights out"
+                "--global and --local together define the appearance; leave out --appearance and --weights"
             )
         specs = ()
     looks = [find(spec) for spec in specs]
@@ -262,7 +263,7 @@ def find_looks(
     if parts != (None, None):
         if len(looks) > 1:
             raise UserError(
-                "--global and --local change one appearance; give one, or --weights to mix several"
+                "--global and --local modify one appearance; give one, or mix several by --weights"
             )
         both = [looks[0] if spec is None else find(spec) for spec in parts]
         looks = [mix(both, [1, 0], local_weights=[0, 1])]

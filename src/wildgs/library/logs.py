@@ -1,4 +1,4 @@
-"""Signals during training: the first finishes the step and saves, the second stops at once."""
+"""The log file of a run, and signals during training: the first saves and stops, the second stops at once."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ logger = logging.getLogger("wildgs")
 
 @contextmanager
 def run_log(folder: Path) -> Iterator[None]:
-    """Appends to the run's log while the block runs; training continues without it if it cannot be written."""
-    logging.raiseExceptions = False  # a full disk must not fill the console with tracebacks of the log
+    """Appends log messages to the run's log file during the block; does nothing if it cannot be written."""
+    logging.raiseExceptions = False  # no tracebacks of the logging module on a full disk
     try:
         if is_there(folder / LOG_FILE):
             check_regular(folder / LOG_FILE)  # opening a pipe would wait for its reader
@@ -56,13 +56,11 @@ def run_log(folder: Path) -> Iterator[None]:
 
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Ctrl-C, the end of a cluster job's time, and a closed terminal."""
-
-logger = logging.getLogger("wildgs")
+"""Sent by Ctrl-C, by a cluster's scheduler at the time limit, and by a terminal that is closed."""
 
 
 class InterruptedTrainingError(KeyboardInterrupt):
-    """Training was stopped by a signal and is saved; `code` is the exit code of the process, 128 + signal."""
+    """Training was stopped by a signal after saving; `code` is the process's exit code, 128 + signal number."""
 
     def __init__(self, message: str, number: int) -> None:
         super().__init__(message)
@@ -70,18 +68,17 @@ class InterruptedTrainingError(KeyboardInterrupt):
 
 
 class StopOnSignal:
-    """An observer of training that ends it between two steps after a signal."""
+    """An observer that stops training after the current step when a signal arrives, on all processes of a team."""
 
     def __init__(self, team: Team | None = None) -> None:
-        """Ends all processes of a team after the same step."""
         self.team = team or Team()
         self.received: int | None = None
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopOnSignal:
-        if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
+        if threading.current_thread() is threading.main_thread():  # Python allows signal handlers only there
             for number in SIGNALS:
-                if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+                if signal.getsignal(number) is not signal.SIG_IGN:  # ignored under nohup
                     self._previous[number] = signal.signal(number, self._receive)
         return self
 
@@ -97,11 +94,11 @@ class StopOnSignal:
     def _receive(self, number: int, _: FrameType | None) -> None:
         if self.received is not None:
             if number == getattr(signal, "SIGHUP", None):
-                return  # a closed terminal sends it to every process of a group, more than once
+                return  # a closed terminal may send it several times
             raise KeyboardInterrupt
         self.received = self.team.received_signal = number
-        with contextlib.suppress(OSError, RuntimeError):  # the signal may have come in the middle of a write
-            logger.info("stopping after this step, then saving; a second signal stops at once, unsaved")
+        with contextlib.suppress(OSError, RuntimeError):  # the signal may have interrupted a write
+            logger.info("saving and stopping after this step; a second signal stops at once without saving")
 
     def __call__(self, report: StepReport) -> None:
         """Raises `InterruptedTrainingError` if a rank has received a signal."""

@@ -1,4 +1,4 @@
-"""The two pages of a run: the report (scores and comparisons), and the page that carries the scene."""
+"""The two web pages of a run: the report (scores and comparisons), and the page with the 3D scene."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class ExportedFile:
     """A written file.
 
     Attributes:
-        file: Where it was written.
-        megabytes: Its size.
-        num_gaussians: Gaussians in it.
+        file: The file.
+        megabytes: Its size in MB.
+        num_gaussians: Number of Gaussians in it.
         sh_degree: Degree of its spherical harmonics.
-        looks: The appearances that it holds: one, or all of the page's.
+        looks: The appearances in it.
     """
 
     file: Path
@@ -68,9 +68,9 @@ def write_webpage(
     title: str,
     cleanup: CleanupConfig | None = None,
 ) -> ExportedFile:
-    """Writes the page of a run under some looks, the first of which it opens with; `cleanup` drops Gaussians.
+    """Writes the web page of a run under several looks; it opens with the first.
 
-    Where the looks are those of photos in the order of the run's day, the page can play the day.
+    If the looks are those of photos in the order of the run's day, the page can play the day.
     """
     cleanup = cleanup or CleanupConfig()
     scene = loaded.scene
@@ -96,13 +96,13 @@ def write_webpage(
 
 
 def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> ExportedFile:
-    """Writes the page of a run under lights chosen for it; ends `wildgs run` and `wildgs demo`."""
+    """Writes the web page of a run under automatically selected lights, for `wildgs run` and `wildgs demo`."""
     loaded = LoadedScene(run)
     return write_webpage(loaded, page_looks(loaded, progress), file, title=title)
 
 
 def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Look]:
-    """The lights of a day; of a run with few photos, those most unlike each other; the one look of plain 3DGS."""
+    """Looks for the web page: the course of a day, else very different photos; one look if it cannot be relit."""
     if not loaded.relightable:
         return [loaded.appearance(NEUTRAL)]
     day = find_day(loaded, progress=progress) if has_day(loaded) else None
@@ -117,7 +117,7 @@ def page_looks(loaded: LoadedScene, progress: Progress | None = None) -> list[Lo
 
 
 def baked(loaded: LoadedScene, look: Look) -> Splats:
-    """The run's Gaussians under a look, in main memory, in the scene's aligned frame."""
+    """The run's Gaussians under a look, on the CPU, in the aligned frame."""
     gaussians = loaded.gaussians
     values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, look.sh)
     sky = loaded.run.method.sky()
@@ -125,7 +125,7 @@ def baked(loaded: LoadedScene, look: Look) -> Splats:
 
 
 def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
-    """The photo whose light it is; where it is none of the scene's, the first view under that light."""
+    """The photo of a look; if it is not a photo of the scene, a render of the start view under it."""
     view = match_view(loaded.views, look.name)
     pixels = loaded.render(start.camera, look) if view is None else view.read_photo()
     return pixels.numpy()
@@ -134,7 +134,7 @@ def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
 EXAMPLES = 4
 LIGHTS = 3
 MISFITS, MASKS = 12, 24
-"""Photos in the report's sections, at most."""
+"""Upper bounds on the number of photos in the report's sections."""
 
 
 def write_showcase(
@@ -144,14 +144,14 @@ def write_showcase(
     scene: Scene,
     runs: Sequence[tuple[str, Run, Scores]],
 ) -> None:
-    """Writes the report of some runs of one scene.
+    """Writes the report on one or more runs on the same scene.
 
     Args:
         file: The HTML file.
-        title: Its headline.
-        summary: A paragraph below it.
+        title: The title.
+        summary: A paragraph below the title.
         scene: The scene of all runs.
-        runs: Name, run and scores; pictures show the first, and the second as its baseline.
+        runs: Name, run and scores. Images show the first run, and the second as its baseline.
     """
     shown = runs[0][1].method
     baseline = runs[1][1].method if len(runs) > 1 else None
@@ -183,7 +183,7 @@ def write_showcase(
 
 
 def _matches(picture: Path | None) -> np.ndarray | None:
-    """The picture of a photo's best matches; None where there is none that can be read."""
+    """The image of a photo's best matches; None if there is none or it cannot be read."""
     try:
         return None if picture is None else read_photo(picture).pixels
     except UnreadableImageError:
@@ -192,7 +192,7 @@ def _matches(picture: Path | None) -> np.ndarray | None:
 
 @torch.no_grad()
 def _beside_masks(method: Method, scene: Scene, fits: Sequence[PhotoFit]) -> tuple[ReportMask, ...]:
-    """Training photos with their masks, and what was measured of them."""
+    """Training photos with their masks, and captions with their measurements."""
     views = {view.name: view for view in scene.train_views}
     device, found = method.gaussians.means.device, []
     for fit in fits:
@@ -213,13 +213,13 @@ def _beside_masks(method: Method, scene: Scene, fits: Sequence[PhotoFit]) -> tup
 
 
 def _without(views: Sequence[View], misfits: Sequence[PhotoFit]) -> list[View]:
-    """Views but those of photos that fit no light: their appearance is that of a drawing or a collage."""
+    """The views without misfits, whose appearance is that of a drawing or a collage."""
     names = {photo.name for photo in misfits}
     return [view for view in views if view.name not in names]
 
 
 def different_lights(views: Sequence[View], count: int) -> list[View]:
-    """Photos as unlike each other in colour as the collection allows; the first is the most usual one."""
+    """Photos that differ most in colour; the first is the most typical one."""
     if not views:
         return []
     described = torch.stack([_colour_of(view) for view in views]).double().numpy()
@@ -237,7 +237,7 @@ def _example(
     method: Method,
     baseline: Method | None,
 ) -> ReportExample:
-    """A view's pictures, also under other photos' lights, which are given as shaded harmonics."""
+    """The images of a view, also under the lights of other photos (given as shaded harmonics)."""
     device = method.gaussians.means.device
     camera = view.camera.to(device)
     appearance = encode_view(method, view)

@@ -39,13 +39,13 @@ CPU_MAX_GAUSSIANS = 80_000
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What `run` and `demo` leave.
+    """Results of `run` and `demo`.
 
     Attributes:
         folder: The run folder, or the demo's folder.
-        scores: By the name of a run; empty where no photo is held out.
-        report: The page with scores and comparisons.
-        page: The page that carries the scene.
+        scores: Scores by the name of the run; empty if no photo is held out.
+        report: The web page with scores and comparisons.
+        page: The web page with the 3D scene.
     """
 
     folder: Path
@@ -68,33 +68,32 @@ def run(
     progress: Progress | None = None,
     observers: Sequence[Observer] = (),
 ) -> FinishedRun:
-    """Poses, trains, scores and shows a folder of photos; stages that are done already are not done again.
+    """Estimates camera poses for a folder of photos, trains, scores and writes web pages; skips finished stages.
 
-    A training that was interrupted continues with the options that it began with, where they are None.
+    When a run is continued, options that are None keep the run's values.
 
     Args:
         photos: Folder of photos.
-        output: Run folder; the posed scene goes to OUTPUT/scene.
-        steps: Training steps; by default 30,000 on a GPU and 3,000 on a CPU.
-        max_side: Reduces each photo so that its own longer side is at most so many pixels; by default 1,600 on a
-            GPU and 400 on a CPU, or no limit where `downscale` is given.
-        downscale: Divides the photos' width and height, before `max_side`.
-        max_gaussians: Upper bound on the number of Gaussians; by default it follows the machine.
-        holdout: Every n-th photo is held out for scoring, by default every eighth; 0 for none.
+        output: Run folder; the scene with camera poses is written to OUTPUT/scene.
+        steps: Training steps. Default: 30,000 on a GPU, 3,000 on a CPU.
+        max_side: Longest side of a photo in pixels; larger photos are reduced to it. Default: 1,600 on a GPU and
+            400 on a CPU, or no limit if `downscale` is given.
+        downscale: Factor by which the photos' width and height are divided, before `max_side`.
+        max_gaussians: Upper bound on the number of Gaussians. Default: depends on the machine's memory.
+        holdout: Hold out every n-th photo for scoring; 0 = none. Default: 8.
         sfm: Options of structure from motion.
-        execution: How it is executed.
+        execution: How training is executed.
         progress: Called during all stages.
         observers: Called with a `StepReport` after every training step.
 
     Raises:
-        UserError: The photos cannot be used, or are others than those that OUTPUT was made from; another process
-            works on OUTPUT.
+        UserError: The photos cannot be used, OUTPUT was made from other photos, or another process uses OUTPUT.
     """
     photos, output, progress = Path(photos), Path(output), progress or silent
-    check_photos(photos, output)  # a wrong folder is reported before anything is written
+    check_photos(photos, output)  # before anything is written
     with lock_run(output):
         scene_folder = output / "scene"
-        _pose(photos, scene_folder, sfm, progress)
+        _estimate_poses(photos, scene_folder, sfm, progress)
         if not (output / CONFIG_FILE).is_file():
             given = DataConfig().holdout if holdout is None else holdout
             estimate_depth(scene_folder, by="stereo", holdout=given, progress=progress)
@@ -122,11 +121,11 @@ def run(
     return FinishedRun(output, {str(output): scores} if scores else {}, report, page)
 
 
-def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) -> None:
-    """Structure from motion, or a check that the poses that are there were made from these photos.
+def _estimate_poses(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) -> None:
+    """Runs structure from motion, or checks that existing poses were computed from these photos.
 
     Raises:
-        UserError: They were not.
+        UserError: They were computed from other photos or with other options.
     """
     if not (scene / "sparse" / "0").is_dir():
         report = reconstruct(photos, scene, sfm, progress=progress)
@@ -137,25 +136,25 @@ def _pose(photos: Path, scene: Path, sfm: SfmConfig | None, progress: Progress) 
     changes = compare_collection(photos, scene)
     if changes:
         raise UserError(
-            f"{photos} holds other photos than {scene} was made from: {changes}; choose another --output, or "
-            f"delete {scene.parent} to start again with these photos"
+            f"{photos} has changed since {scene} was made: {changes}; choose another --output, or delete "
+            f"{scene.parent} to start again with these photos"
         )
     if options := changed_options(scene, sfm or SfmConfig()):
         raise UserError(
-            f"{scene} has poses that were made with other options ({options}); leave them out, or choose another "
+            f"the poses in {scene} were computed with other options ({options}); leave them out, or choose another "
             "--output"
         )
-    logger.info("%s has poses of these photos already; continuing with them", scene)
+    logger.info("using the existing poses in %s", scene)
 
 
 @dataclass(frozen=True)
 class EstimatedDepth:
-    """What `estimate_depth` did.
+    """Results of `estimate_depth`.
 
     Attributes:
         folder: SCENE/depth.
-        written: Photos estimated.
-        kept: Photos that had an estimate before.
+        written: Number of depth maps written.
+        kept: Number of depth maps that existed already.
     """
 
     folder: Path
@@ -174,21 +173,21 @@ def estimate_depth(
     device: str | None = None,
     progress: Progress | None = None,
 ) -> EstimatedDepth:
-    """Estimates the depth of the photos of a scene, written to SCENE/depth/.
+    """Estimates depth maps for the photos of a scene and writes them to SCENE/depth/.
 
     Args:
         scene: Folder of a COLMAP scene.
-        by: 'network': disparity of every photo by Depth Anything, as 16-bit pictures. 'stereo': metric depth of the
-            training photos by multi-view stereo, as 32-bit floats in units of the model.
-        model: Folder of the network in the hub's layout, or its name on the hub.
+        by: 'network': disparity of every photo by Depth Anything V2, as 16-bit PNGs. 'stereo': metric depth of the
+            training photos by multi-view stereo, as 32-bit floats in units of the COLMAP model.
+        model: Name of the network on the Hugging Face hub, or its folder in the hub's layout.
         stereo: Options of stereo.
-        holdout: Every n-th photo is held out where the scene has no .tsv split: stereo does not look at it.
-        overwrite: Estimate again what is already there.
-        device: `cpu` or `cuda`, for the network; by default CUDA where there is one.
+        holdout: For stereo: skip every n-th photo if the scene has no .tsv split.
+        overwrite: Replace existing depth maps.
+        device: Device of the network, `cpu` or `cuda`. Default: CUDA if available.
         progress: Called for every photo.
 
     Raises:
-        UserError: There is no such scene, or the network cannot be had.
+        UserError: The scene does not exist, or the network is not available.
     """
     scene = Path(scene)
     if not scene.is_dir():
@@ -207,7 +206,7 @@ def estimate_depth(
 
 
 def _estimate_depth_if_possible(scene: Path, progress: Progress) -> None:
-    """Fills what is missing in the scene's depth folder; warns and continues where the network cannot be had."""
+    """Writes missing depth maps by the network; warns if it is not available."""
     estimator = load_depth_anything()
     if estimator is not None:
         fill_depth_folder(scene, estimator, progress=counter(progress, "estimating depth"))
@@ -221,7 +220,7 @@ def _configure(
     max_gaussians: int | None,
     holdout: int | None,
 ) -> RunConfig:
-    """The run's own configuration, or one that suits the machine, with the options that were given."""
+    """The configuration of an existing run, or the machine's default, with the given options."""
     if file.is_file():
         config = read_config(file)
     else:
@@ -239,7 +238,7 @@ def _configure(
 
 
 def _photo_size(output: Path, max_side: int | None, downscale: float | None) -> DataConfig:
-    """The size of photos: as asked for, as OUTPUT was begun with, or as it suits the machine."""
+    """The size of photos: as given, as in an existing run, or the machine's default."""
     if max_side is None and downscale is None:
         if (output / CONFIG_FILE).is_file():
             return read_config(output / CONFIG_FILE).data
@@ -250,13 +249,13 @@ def _photo_size(output: Path, max_side: int | None, downscale: float | None) -> 
 COMPARED: tuple[MethodName, ...] = ("wildgs", "3dgs")
 TITLE = "Wild-GS demo"
 SUMMARY = (
-    "A made-up landmark in {photos} rendered photos: different hours and cameras, and people in the way. Wild-GS "
-    "and plain 3D Gaussian Splatting were trained on them for {steps:,} steps each. Both are scored on held-out "
-    "photos, against the same views without the people."
+    "An artificial landmark in {photos} rendered photos with different times of day, cameras and passers-by. "
+    "Wild-GS and plain 3D Gaussian Splatting were trained on them for {steps:,} steps each. Both are scored on "
+    "held-out photos, against the same views without passers-by."
 )
 PARSED_SIDE = 160
 MAX_GAUSSIANS = 30_000
-"""As many Gaussians as photos of this size can resolve."""
+"""Sufficient for the resolution of the demo's photos."""
 
 
 def demo(
@@ -267,24 +266,24 @@ def demo(
     progress: Progress | None = None,
     observers: Sequence[Observer] = (),
 ) -> FinishedRun:
-    """Trains Wild-GS and plain 3DGS on the photos of the built-in landmark, scores both and writes pages.
+    """Trains Wild-GS and plain 3DGS on photos of the built-in landmark, scores both and writes web pages.
 
     Args:
         output: Folder for the scene, both runs, report.html and scene.html.
         steps: Training steps of each method.
-        execution: How it is executed.
+        execution: How training is executed.
         progress: Called during all stages.
         observers: Called with a `StepReport` after every training step.
 
     Raises:
-        UserError: The pages exist already, or the folder cannot be written to.
+        UserError: The pages already exist, or the folder cannot be written to.
     """
     output = Path(output)
     report, page = output / "report.html", output / "scene.html"
     if steps < 1:
         raise UserError(f"steps {steps}: must be 1 or more")
     if report.exists():
-        raise UserError(f"{report} exists already; open it, or choose another --output")
+        raise UserError(f"{report} already exists; open it, or choose another --output")
     with lock_run(output):
         folder = write_demo_scene(output / "scene")
         runs = []

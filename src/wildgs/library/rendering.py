@@ -1,4 +1,4 @@
-"""`wildgs.render`: pictures of a run from the photos' viewpoints, or a video along a path, in any light."""
+"""`wildgs.render`: renders images from the photos' viewpoints, or a video along a path, in any light."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ Spec = str | Path | Look
 
 @dataclass(frozen=True)
 class Rendered:
-    """What was rendered.
+    """Results of `render`.
 
     Attributes:
         output: The file or folder.
-        pictures: How many pictures or frames.
+        pictures: Number of images or frames.
         size: Width and height of the last one.
-        fps: Frames per second of a video; None for stills.
+        fps: Frames per second of a video; None for images.
         looks: The appearances.
-        day: The day over which the light changes, if it does.
+        day: The day shown, with `over="day"`.
     """
 
     output: Path
@@ -70,35 +70,37 @@ def render(
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> Rendered:
-    """Renders stills, or a video.
+    """Renders images or a video.
 
     Args:
         run: A run folder, or a loaded scene.
-        output: A video (.mp4, .mkv, .mov), a picture (.png, .jpg) of one view in one light, or a folder: of frames
-            where there is a path, else of OUTPUT/<appearance>/<view>.png.
-        appearance: What `LoadedScene.appearance` takes.
-        to: Appearances to which the light changes during a video, one after the other.
-        over: `"day"` shows the lights of the photos in the order of a day (`wildgs.library.day.find_day`),
-            instead of `appearance` and `to`.
-        photos: Folder of the original photos, whose EXIF blocks tell the hour; None takes the scene folder.
-        views: Photos whose viewpoint is rendered, by name; by default the held-out photos, or all where none is.
-        trajectory: Path, length and size.
-        mixing: How appearances are found and mixed.
-        progress: Called for every picture.
+        output: A video (.mp4, .mkv, .mov), an image (.png, .jpg) of one view in one light, or a folder: for the
+            frames of a path, else for <appearance>/<view>.png.
+        appearance: Anything that `LoadedScene.appearance` accepts.
+        to: Appearances to which the light changes during a video, in this order.
+        over: `"day"` shows the course of a day (`wildgs.library.day.find_day`) instead of `appearance` and `to`.
+        photos: Folder of the original photos with EXIF times, for `over`; None takes the scene folder.
+        views: Names of the photos whose viewpoints are rendered. Default: the held-out photos, or all photos if
+            there are none.
+        trajectory: Camera path, length and size.
+        mixing: How appearances are obtained and mixed.
+        progress: Called for every image.
 
     Raises:
-        UserError: Something that was named does not exist, or cannot be rendered or written.
+        UserError: A photo, appearance or path does not exist, or an image cannot be rendered or written.
     """
     output, trajectory = Path(output), trajectory or TrajectoryOptions()
     if trajectory.size is not None:
         check_size(*trajectory.size)
     if photos is not None and over is None:
-        raise UserError("--photos tells the hours of photos for --over day; leave it out")
+        raise UserError("--photos is only used with --over day; leave it out")
     if over is not None:
         return _render_day(loaded(run), output, photos, views, trajectory, progress)
     if trajectory.path is None and not is_video(output):
         if to:
-            raise UserError("--to changes light over time: add --path, or name a video as --output")
+            raise UserError(
+                "--to changes the light during a video: add --path, or give a video file as --output"
+            )
         return _render_views(loaded(run), output, appearance, views, trajectory.size, mixing, progress)
     check_output(output)
     scene = loaded(run)
@@ -121,7 +123,7 @@ def _render_day(
     trajectory: TrajectoryOptions,
     progress: Progress | None,
 ) -> Rendered:
-    """A video over the light of a day."""
+    """Renders a video over the course of a day."""
     check_output(output)
     if trajectory.path == "still" and not views:
         views = [start_view(scene).name]
@@ -138,10 +140,10 @@ def _render_day(
 
 
 def check_size(width: int, height: int) -> None:
-    """Raises `UserError` for sizes without pixels, or with too many."""
+    """Raises `UserError` for images without pixels or with too many."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise UserError(
-            f"--size {width} {height}: sides must be from 1 to {MAX_SIDE:,} pixels, and the picture at most "
+            f"--size {width} {height}: sides must be from 1 to {MAX_SIDE:,} pixels, and the image at most "
             f"{MAX_PIXELS / 1e6:.0f} megapixels"
         )
 
@@ -155,12 +157,12 @@ def _render_views(
     mixing: MixOptions | None,
     progress: Progress | None,
 ) -> Rendered:
-    """Every view under every appearance."""
+    """Renders every view under every appearance."""
     single = output.suffix.lower() in PICTURE_SUFFIXES
     if not single:
         check_output(output)
         if output.is_file():
-            raise UserError(f"{output} is a file; give a folder for the pictures")
+            raise UserError(f"{output} is a file; give a folder for the images")
     collection = scene.scene
     views = [find_view(collection, name) for name in names] or collection.test_views or collection.train_views
     if not views:
@@ -169,7 +171,9 @@ def _render_views(
     if single:
         views = views if names else views[:1]
         if len(views) * len(looks) != 1:
-            raise UserError(f"{output} holds one picture; give one --view and one --appearance, or a folder")
+            raise UserError(
+                f"{output} is one image; give one --view and one --appearance, or a folder as --output"
+            )
     shape = (0, 0)
     for picture in render_each(scene, views, looks, None if single else output, size, progress):
         shape = (picture.shape[1], picture.shape[0])
@@ -192,9 +196,9 @@ def render_each(
         scene: The loaded scene.
         views: Photos whose viewpoints are rendered.
         looks: Their appearances.
-        folder: Each picture is written to FOLDER/<appearance>/<view>.png; None writes nothing.
-        size: Width and height; None takes each photo's own.
-        progress: Called for every picture.
+        folder: Each image is written to FOLDER/<appearance>/<view>.png; None writes nothing.
+        size: Width and height; None takes that of each photo.
+        progress: Called for every image.
     """
     paths = picture_paths([view.name for view in views])
     folders = picture_paths([look.name for look in looks])
@@ -210,14 +214,14 @@ def render_each(
 def _find_cameras(
     scene: LoadedScene, trajectory: TrajectoryOptions, views: Sequence[str]
 ) -> tuple[list[Camera], float]:
-    """The video's cameras and its frames per second."""
+    """Cameras and frames per second of the video."""
     kind = trajectory.path or ("views" if len(views) > 1 else DEFAULT_PATH)
     fps = trajectory.fps or DEFAULT_FPS
     if kind not in (*AROUND, *THROUGH) and Path(kind).suffix and trajectory.size is None:
         cameras, file_fps = read_path(scene.scene, Path(kind))
         sizes = {(camera.width, camera.height) for camera in cameras}
         if len(sizes) > 1:
-            raise UserError(f"{kind}: the pictures of a video must be of one size")
+            raise UserError(f"{kind}: the cameras of a video must all have the same image size")
         return cameras, trajectory.fps or file_fps
     seconds = DEFAULT_SECONDS if trajectory.seconds is None else trajectory.seconds
     if not (fps > 0 and seconds > 0 and seconds * fps <= MAX_FRAMES):
@@ -230,7 +234,7 @@ def _find_cameras(
 
 
 def _even(camera: Camera) -> Camera:
-    """The camera without the last odd column and row, which H.264 cannot have."""
+    """Crops a camera to even width and height, as H.264 requires."""
     return camera.cropped(0, 0, max(2, camera.width // 2 * 2), max(2, camera.height // 2 * 2))
 
 

@@ -1,4 +1,4 @@
-"""When the photos of a run were taken, from the EXIF blocks of their files."""
+"""Capture times and places of a run's photos, from EXIF data."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from wildgs.scene.photo_store import with_ending
 
 
 def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, Capture]:
-    """Time and place of the photos whose files can be found and say so.
+    """Reads time and place of all photos that have EXIF data.
 
     Args:
         loaded: The run.
-        photos: Folder of the original photos, whose endings may differ from those of the scene; None looks in the
-            scene folder of the run, where the undistorted photos of `wildgs sfm` keep time and place, and at the
-            run's own copies of its photos.
+        photos: Folder of the original photos, whose extensions may differ from those of the scene. None looks in
+            the run's scene folder (undistorted photos of `wildgs sfm` keep EXIF time and place) and at the copies
+            in the run folder.
 
     Raises:
-        UserError: There is no folder `photos`.
+        UserError: The folder `photos` does not exist.
     """
     originals = None if photos is None else _by_stem(photos)
     folder = photos or _scene_photos(loaded)
@@ -39,7 +39,7 @@ def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, 
 
 
 def _by_stem(photos: Path) -> dict[str, Path]:
-    """The files of a folder by their path in it without ending."""
+    """The files of a folder by relative path without extension."""
     if not photos.is_dir():
         raise UserError(f"{photos}: no such folder; give the folder of the original photos")
     return {
@@ -57,5 +57,5 @@ def _scene_photos(loaded: LoadedScene) -> Path | None:
 
 
 def read_times(loaded: LoadedScene) -> dict[str, str]:
-    """Local times in ISO 8601, by the names of photos."""
+    """Local capture times in ISO 8601, by photo name."""
     return {name: capture.local.isoformat() for name, capture in read_captures(loaded).items()}

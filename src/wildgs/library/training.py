@@ -1,4 +1,4 @@
-"""`wildgs.train`: trains a scene with poses, within memory, with records, checkpoints and signals."""
+"""`wildgs.train`: plans memory, trains, logs, saves checkpoints and handles signals."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from wildgs.scene.config import parse_bytes
 from wildgs.threads import limited
 
 LEAST_SECONDS_ON_CUDA = 60.0
-"""Between two checkpoints; on a GPU a thousand steps take some ten seconds."""
+"""Smallest time between checkpoints on a GPU, where a thousand steps take about ten seconds."""
 RETRY_SHARE = 0.8
-"""Bound on the Gaussians of the second try, as a share of those with which memory ran out."""
+"""Upper bound on Gaussians of the second attempt, relative to their number when memory ran out."""
 BUDGET = "train.density.max_gaussians"
-"""The one entry that may change when a run is resumed: it depends on the machine's memory."""
+"""The only entry that may change when a run is resumed, since it depends on the machine's memory."""
 
 Attachment = Callable[[Trainer, Scene], AbstractContextManager[Observer]]
 """Opens an observer of one training, such as a viewer, which is closed when the training ends or fails."""
@@ -57,11 +57,11 @@ class TrainedRun:
     Attributes:
         folder: The run folder.
         config: Its configuration.
-        steps: Steps done.
+        steps: Number of steps done.
         seconds: Training time, without reading photos and saving.
-        num_gaussians: N at the end.
-        device: Name of the GPU, or the CPU.
-        photos: How well each training photo fits; `find_misfits` picks those that fit no light.
+        num_gaussians: Final number of Gaussians.
+        device: Name of the GPU, or "the CPU".
+        photos: How well each training photo fits; `find_misfits` selects misfits.
     """
 
     folder: Path
@@ -75,7 +75,7 @@ class TrainedRun:
 
 @dataclass(frozen=True)
 class _Job:
-    """What stays the same when training is tried again with fewer Gaussians."""
+    """Arguments that stay the same when training is retried with fewer Gaussians."""
 
     folder: Path
     scene: Scene
@@ -100,28 +100,28 @@ def train(
     team: Team | None = None,
     locked: bool = False,
 ) -> TrainedRun:
-    """Trains a run to its end.
+    """Trains a run.
 
-    The first SIGINT, SIGTERM or SIGHUP ends training after the present step and saves. If a GPU's memory runs out,
+    The first SIGINT, SIGTERM or SIGHUP saves and stops after the current step. If a GPU runs out of memory,
     training continues once from the newest checkpoint with fewer Gaussians.
 
     Args:
         scene: A scene folder, or a scene read from one.
-        config: Options that decide the outcome; None takes the defaults, or the run's own on resuming.
+        config: Options that affect the result; None takes the defaults, or the run's when resuming.
         output: The run folder.
-        execution: Options without influence on the outcome.
-        resume: Continue from the newest checkpoint; "auto" does so if the folder holds a run.
-        max_gaussians: Bound on the number of Gaussians; it is an error, not lowered, if memory is too small for it.
+        execution: Options that do not affect the result.
+        resume: Continue from the newest checkpoint; "auto" does so if the folder contains a run.
+        max_gaussians: Upper bound on the number of Gaussians; too little memory for it is an error.
         progress: Called for every photo read and for every step.
         observers: Called with a `StepReport` after every step.
         attach: Openers of further observers, which are closed when training ends.
-        team: The processes that train together; by default this one alone.
+        team: The processes that train together. Default: this process alone.
         locked: Whether the caller holds the run folder's lock.
 
     Raises:
-        UserError: The scene cannot be used, the folder holds another run, memory or disk do not suffice, or
+        UserError: The scene cannot be used, the folder contains another run, memory or disk space is too small, or
             training diverged.
-        InterruptedTrainingError: A signal came; the last step is saved.
+        InterruptedTrainingError: A signal arrived; the last step is saved.
     """
     folder, execution, team = Path(output), execution or ExecutionConfig(), team or Team()
     progress = progress or silent
@@ -150,11 +150,11 @@ def train(
         return _train_within_memory(job, config, resume=bool(resume))
 
 
-def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunConfig:
-    """The configuration of a resumed run; raises `UserError` if another one is asked for than the run has."""
-    if asked is None:
+def _resumed(folder: Path, stored: RunConfig, requested: RunConfig | None) -> RunConfig:
+    """The configuration of a resumed run; raises `UserError` if it differs from the stored one."""
+    if requested is None:
         return stored
-    differing = differing_entries(stored, asked)
+    differing = differing_entries(stored, requested)
     differing.pop(BUDGET, None)
     if differing:
         changes = ", ".join(f"{path} is {old}, not {new}" for path, (old, new) in list(differing.items())[:3])
@@ -162,20 +162,20 @@ def _resumed(folder: Path, stored: RunConfig, asked: RunConfig | None) -> RunCon
             f"{folder} holds a run with other settings ({changes}), which resuming cannot change; leave these "
             "options out, or choose another --output for a new run"
         )
-    return asked
+    return requested
 
 
 def read_scene(config: RunConfig, execution: ExecutionConfig, progress: Progress | None = None) -> Scene:
-    """Reads the scene of a configuration, and logs what is in it."""
+    """Reads the scene of a configuration and logs its size."""
     show = counter(progress, "reading photos")
     scene = load_scene(config.scene, config.data, image_cache=execution.image_cache, progress=show)
     train, test = len(scene.train_views), len(scene.test_views)
-    logger.info(f"{scene.root}: {train} photos train, {test} test, {len(scene.points):,} points")
+    logger.info(f"{scene.root}: {train} training photos, {test} test photos, {len(scene.points):,} points")
     return scene
 
 
 def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
-    """The configuration with another bound on the number of Gaussians, which must be 1 or more."""
+    """The configuration with another upper bound on the number of Gaussians, which must be 1 or more."""
     if max_gaussians < 1:
         raise UserError(f"--max-gaussians {max_gaussians}: must be 1 or more")
     density = replace(config.train.density, max_gaussians=max_gaussians)
@@ -183,16 +183,16 @@ def with_budget(config: RunConfig, max_gaussians: int) -> RunConfig:
 
 
 def plan_memory(config: RunConfig, scene: Scene, *, explicit: bool = False) -> RunConfig:
-    """The configuration with a budget of Gaussians that fits into memory; warns if it is lowered."""
-    asked = config.train.density.max_gaussians
-    budget, message = plan_budget(config.method, scene, asked, default_device(), explicit=explicit)
+    """Lowers the upper bound on the number of Gaussians, with a warning, if memory is too small."""
+    requested = config.train.density.max_gaussians
+    budget, message = plan_budget(config.method, scene, requested, default_device(), explicit=explicit)
     if message is not None:
         warnings.warn(message, WildGSWarning, stacklevel=2)
-    return config if budget == asked else with_budget(config, budget)
+    return config if budget == requested else with_budget(config, budget)
 
 
 def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> TrainedRun:
-    """Trains to the end; if the GPU's memory runs out, once more from the newest checkpoint."""
+    """Trains to the end; retries once from the newest checkpoint if the GPU runs out of memory."""
     result = _train_unless_full(job, config, resume)
     if isinstance(result, TrainedRun):
         return result
@@ -200,22 +200,22 @@ def _train_within_memory(job: _Job, config: RunConfig, *, resume: bool) -> Train
     torch.cuda.empty_cache()
     budget = result.train.density.max_gaussians
     message = (
-        f"the GPU's memory ran out; continuing from the newest checkpoint with at most {budget:,} Gaussians"
+        f"the GPU ran out of memory; continuing from the newest checkpoint with at most {budget:,} Gaussians"
     )
     warnings.warn(message, WildGSWarning, stacklevel=3)
     again = _train_unless_full(job, result, True)
     if isinstance(again, TrainedRun):
         return again
     raise UserError(
-        "the GPU's memory ran out again: continue with --resume and a lower --max-gaussians, or train again with a "
-        "higher --downscale; other programs on this GPU take memory too (nvidia-smi shows them)"
+        "the GPU ran out of memory again: continue with --resume and a lower --max-gaussians, or train again with "
+        "a higher --downscale; other programs on this GPU use memory too (nvidia-smi lists them)"
     )
 
 
 def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun | RunConfig:
-    """Trains to the end, or returns the configuration to try next; its trainer is freed by then.
+    """Trains to the end, or frees the trainer and returns a smaller configuration if GPU memory runs out.
 
-    If memory runs out on one of several processes, that is an error: the others cannot start again.
+    With several processes, running out of memory is an error, because the others cannot be restarted.
     """
     trainer: Trainer | None = None
     try:
@@ -231,7 +231,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
         trainer.feature_cache = parse_bytes(job.execution.feature_cache)
-        trainer.on_final_photo = counter(job.progress, "learning the lights of training photos")
+        trainer.on_final_photo = counter(job.progress, "fitting the light of training photos")
         with ExitStack() as stack:
             if job.team.first:
                 observers = [stack.enter_context(open_one(trainer, job.scene)) for open_one in job.attach]
@@ -240,7 +240,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
     except torch.OutOfMemoryError as error:
         if job.team.size > 1:
             raise UserError(
-                "a GPU's memory ran out: continue with --resume and a lower --max-gaussians"
+                "a GPU ran out of memory: continue with --resume and a lower --max-gaussians"
             ) from error
         count = len(job.scene.points) if trainer is None else len(trainer.method.gaussians)
         budget = min(count, config.train.density.max_gaussians)
@@ -250,7 +250,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
 def _train_to_end(
     job: _Job, config: RunConfig, trainer: Trainer, observers: Sequence[Observer]
 ) -> TrainedRun:
-    """Trains the remaining steps with records and checkpoints; only whole steps are saved."""
+    """Trains the remaining steps with logs and checkpoints, on rank 0."""
     team, folder, execution = job.team, job.folder, job.execution
     label = f"training {config.method}" + (f" on {team.size} processes" if team.size > 1 else "")
     alignment = job.scene.alignment
@@ -288,7 +288,9 @@ def _train_to_end(
             trainer.run([recorder, *observers, show, saver, stop])
         except InterruptedTrainingError as interrupt:
             team.from_first(lambda: _save_last(saver, writer, trainer.step, hurry=True))
-            interrupt.args = (f"{interrupt}, saved in {folder}; the same command with --resume continues",)
+            interrupt.args = (
+                f"{interrupt}, saved in {folder}; run the same command with --resume to continue",
+            )
             raise
         _save_last(saver, writer, trainer.step)
         result = replace(_result(job, config, trainer), photos=_inspect(job, trainer))
@@ -302,7 +304,7 @@ def _train_to_end(
 
 
 def _inspect(job: _Job, trainer: Trainer) -> list[PhotoFit]:
-    """Looks for photos that fit no light, and keeps what it finds in the run folder."""
+    """Measures how well each training photo fits and writes the result to the run folder."""
     photos = inspect_photos(trainer.method, job.scene, counter(job.progress, "inspecting training photos"))
     write_photos(job.folder, trainer.step, photos)
     return photos
@@ -311,12 +313,12 @@ def _inspect(job: _Job, trainer: Trainer) -> list[PhotoFit]:
 def _save_last(saver: Autosave, writer: CheckpointWriter, step: int, *, hurry: bool = False) -> None:
     """Saves the last step and waits until it is on the disk; see `Autosave.save_last`."""
     if not writer.finish():
-        saver.saved_step = 0  # what was being written failed: the last step is to be written again
+        saver.saved_step = 0  # writing failed: the last step must be written again
     saver.save_last(step, hurry=hurry)
 
 
 def _follow(job: _Job, config: RunConfig, trainer: Trainer) -> TrainedRun:
-    """Trains on a rank other than 0, which alone writes and prints."""
+    """Trains on a rank other than 0: no output and no files."""
     with StopOnSignal(trainer.team) as stop:
         try:
             trainer.run([stop])

@@ -1,4 +1,4 @@
-"""Run folders: what training writes and all other commands read."""
+"""Run folders, which training writes and all other commands read."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LOCK_FILE = ".lock"
 
 
 def default_device() -> torch.device:
-    """CUDA where torch has it, else the CPU."""
+    """CUDA if available, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -45,9 +45,9 @@ class Run:
         folder: The run folder.
         config: Its configuration.
         method: The trained method.
-        step: Steps done.
+        step: Number of steps done.
         train_seconds: Training time.
-        alignment: From the input's frame to the scene's.
+        alignment: Transform from the COLMAP model's frame to the aligned frame.
     """
 
     folder: Path
@@ -59,14 +59,14 @@ class Run:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene as the run folder carries it: cameras, points, alignment, split, and photos on demand.
+        """The scene as stored in the run folder: cameras, points, alignment, split, and photos on demand.
 
-        Its photos are copies, as large as their cameras but of no more detail than `CarriedPhotos.detail`: enough
-        to read their light and to show them, not to score against or to train on (`read_scene` is for that). Runs
-        of earlier versions carry no scene; theirs is read from the scene folder.
+        Photos have their cameras' size but are copies of limited detail (`CarriedPhotos.detail`), sufficient for
+        embedding and display but not for scoring or training (see `read_scene`). For runs of earlier versions,
+        which do not contain their scene, the scene folder is read.
 
         Raises:
-            UserError: What the run carries cannot be read; or it carries nothing, and its scene folder is gone.
+            UserError: The stored scene cannot be read; or there is none, and the scene folder does not exist.
         """
         carried = read_carried_scene(self.folder)
         if carried is not None:
@@ -75,17 +75,17 @@ class Run:
         return load_scene(root, self.config.data, alignment=self.alignment, lazy=True)
 
     def read_scene(self, root: Path | None = None, progress: Counter | None = None) -> Scene:
-        """The scene with its full photos, masks, depth priors and truth, from its folder.
+        """Reads the scene with its original photos, masks, depth maps and ground truth from the scene folder.
 
-        Cameras, split, points and alignment are the run's own, so that a scene folder that changed since changes no
-        score silently: one warning says what differs.
+        Cameras, split, points and alignment are those stored in the run, so that later changes of the scene folder
+        do not affect scores; a warning lists the differences.
 
         Args:
             root: The scene folder; None takes the one on which the run was trained.
-            progress: Called with (photos read, photos in all).
+            progress: Called with (photos read, total number of photos).
 
         Raises:
-            UserError: The folder is missing, cannot be read, or holds another scene.
+            UserError: The folder is missing, cannot be read, or contains another scene.
         """
         root = self._scene_folder(root)
         found = load_scene(root, self.config.data, alignment=self.alignment, progress=progress)
@@ -97,8 +97,8 @@ class Run:
         root = root or self.config.scene
         if not root.is_dir():
             raise UserError(
-                f"{root}: no such folder; {self.folder} was trained on the photos there: give `wildgs eval` the "
-                "folder where they are now by --scene; a run of an earlier version carries them once it is resumed "
+                f"{root}: no such folder, but {self.folder} was trained on its photos: `wildgs eval` takes their "
+                "present folder by --scene; a run of an earlier version stores copies when it is resumed "
                 f"(`wildgs train SCENE --output {self.folder} --resume`)"
             )
         return root
@@ -108,7 +108,7 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
     """Loads the newest checkpoint of a run.
 
     Raises:
-        UserError: The folder holds no run, or no checkpoint yet.
+        UserError: The folder is not a run folder, or has no checkpoint yet.
     """
     if not (folder / CONFIG_FILE).is_file():
         raise UserError(
@@ -120,8 +120,7 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
         raise UserError(f"{folder} has no checkpoint yet; let `wildgs train` finish or resume it")
     if changes := edited_entries(config, checkpoint.header.get("config")):
         warnings.warn(
-            f"{folder / CONFIG_FILE} was changed after training ({changes}); what follows is of the changed "
-            "configuration",
+            f"{folder / CONFIG_FILE} was changed after training ({changes}); the changed configuration is used",
             WildGSWarning,
             stacklevel=2,
         )
@@ -139,22 +138,22 @@ def load_run(folder: Path, device: torch.device | None = None) -> Run:
 
 @contextmanager
 def _complete(folder: Path) -> Iterator[None]:
-    """Reports entries that a checkpoint lacks as a `UserError`: it is of another program, or another version."""
+    """Raises `UserError` if entries of a checkpoint are missing: it was not written by this version."""
     try:
         yield
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
         first = (str(error).splitlines() or [""])[0]
         raise UserError(
-            f"{folder}: its checkpoint is not one of this version's training ({type(error).__name__}: {first})"
+            f"{folder}: its checkpoint was not written by this version ({type(error).__name__}: {first})"
         ) from error
 
 
 @contextmanager
 def holding(lock_file: Path) -> Iterator[bool | None]:
-    """Tries to lock a file while the block runs; the lock ends with the process.
+    """Tries to lock a file for the duration of the block; the lock ends with the process.
 
     Yields:
-        Whether this process holds the lock; None on a disk without locks, as some network disks are.
+        Whether this process holds the lock; None on a file system without locks, such as some network disks.
 
     Raises:
         UserError: The folder cannot be written to.
@@ -180,14 +179,14 @@ def holding(lock_file: Path) -> Iterator[bool | None]:
 
 @contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Keeps other trainings out of a run folder while the block runs.
+    """Locks a run folder against other processes for the duration of the block.
 
     Raises:
         UserError: Another process uses the folder, or it cannot be written to.
     """
     with holding(folder / LOCK_FILE) as held:
         if held is None:
-            message = f"{folder} is on a disk without locks: nothing keeps a second training out of it"
+            message = f"{folder} is on a file system without locks: do not start a second training in it"
             warnings.warn(message, WildGSWarning, stacklevel=3)
         elif not held:
             raise UserError(
@@ -202,7 +201,7 @@ def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | 
 
 
 def refuse_trained(folder: Path) -> None:
-    """Raises `UserError` if a folder holds a run already, or no checkpoints can be written to it."""
+    """Raises `UserError` if a folder already contains a run, or checkpoints cannot be written to it."""
     checkpoints = folder / CHECKPOINT_FOLDER
     if checkpoints.exists() and not checkpoints.is_dir():
         raise UserError(f"{checkpoints} is not a folder: move it away, or choose another --output")
@@ -219,20 +218,20 @@ def prepare_training(
     team: Team | None = None,
     progress: Counter | None = None,
 ) -> Trainer:
-    """A trainer at step 0, or at the newest undamaged checkpoint of a run, with a budget that may be lower.
+    """Creates a trainer at step 0, or at the newest undamaged checkpoint of a run.
 
-    Of several processes, rank 0 alone reads and writes the run folder.
+    Only rank 0 reads and writes the run folder.
 
     Args:
         folder: The run folder.
-        config: Of the run.
+        config: Configuration of the run. When resuming, its upper bound on Gaussians may be lower than before.
         scene: The scene to train on.
         resume: Whether to resume a run.
         team: The processes that train the run.
-        progress: Called with (photos, photos in all) while photos are copied to the run folder.
+        progress: Called with (photos copied, total number of photos) while photos are copied to the run folder.
 
     Raises:
-        UserError: As `start_training` and `resume_training` do.
+        UserError: See `start_training` and `resume_training`.
     """
     if not resume:
         return start_training(folder, config, scene, team=team, progress=progress)
@@ -243,7 +242,7 @@ def prepare_training(
         team.from_first(lambda: write_config(folder / CONFIG_FILE, config))
     trainer = resume_training(folder, scene, team=team, progress=progress)
     if config.train.density.max_gaussians < stored.train.density.max_gaussians and trainer.shrink_to_budget():
-        # Saved at once, so that a run that is killed now resumes from this state.
+        # Saved at once, so that a run killed before the next checkpoint resumes from this state.
         team.from_first(lambda: save_run(folder, trainer, config, scene.alignment))
     return trainer
 
@@ -256,15 +255,15 @@ def start_training(
     team: Team | None = None,
     progress: Counter | None = None,
 ) -> Trainer:
-    """A trainer at step 0; writes the run's configuration and what the run carries of its scene.
+    """Creates a trainer at step 0; writes the configuration and a copy of the scene to the run folder.
 
     Raises:
-        UserError: The folder already holds a trained run.
+        UserError: The folder already contains a trained run.
     """
     team = team or Team()
-    team.from_first(lambda: _claim(folder, config, scene, progress))
+    team.from_first(lambda: _create_run_folder(folder, config, scene, progress))
     device = device or default_device()
-    # The trainer keeps the generators' states; the process gets its own back.
+    # The trainer stores the generators' states; those of the process are restored.
     with team.propagate_errors(), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(config.train.seed)
         budget = config.train.density.max_gaussians
@@ -274,7 +273,7 @@ def start_training(
         return Trainer(method.to(device), scene, config.train, team)
 
 
-def _claim(folder: Path, config: RunConfig, scene: Scene, progress: Counter | None) -> None:
+def _create_run_folder(folder: Path, config: RunConfig, scene: Scene, progress: Counter | None) -> None:
     refuse_trained(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_config(folder / CONFIG_FILE, config)
@@ -288,13 +287,13 @@ def resume_training(
     team: Team | None = None,
     progress: Counter | None = None,
 ) -> Trainer:
-    """A trainer at the newest undamaged checkpoint, with the configuration that the run began with.
+    """Creates a trainer at the newest undamaged checkpoint, with the run's configuration.
 
-    A run that was killed before its first checkpoint starts at step 0 again. Cameras, split, points and alignment
-    are those that the run carries; a run of an earlier version carries them from now on.
+    A run without checkpoints starts at step 0. Cameras, split, points and alignment are those stored in the run; a
+    run of an earlier version stores them now.
 
     Raises:
-        UserError: The folder holds no run, all checkpoints are damaged, or the run is of another scene.
+        UserError: The folder is not a run folder, all checkpoints are damaged, or the run is of another scene.
     """
     team = team or Team()
     config = team.from_first(lambda: read_config(folder / CONFIG_FILE))
@@ -314,8 +313,8 @@ def resume_training(
 def _refuse_edited(folder: Path, config: RunConfig, checkpoint: Checkpoint) -> None:
     if changes := edited_entries(config, checkpoint.header.get("config")):
         raise UserError(
-            f"{folder / CONFIG_FILE} was changed after training began ({changes}); put it back as it was, or start "
-            "a new run in another --output"
+            f"{folder / CONFIG_FILE} was changed after training began ({changes}); undo the change, or start a new "
+            "run in another --output"
         )
 
 
@@ -327,6 +326,6 @@ def save_run(folder: Path, trainer: Trainer, config: RunConfig, alignment: Align
 def run_state(
     trainer: Trainer, config: RunConfig, alignment: Alignment
 ) -> tuple[int, dict[str, Tensor], dict[str, Any]]:
-    """What a checkpoint of a run holds: step, tensors and header."""
+    """Content of a checkpoint: step, tensors and header."""
     header: dict[str, Any] = {"config": to_plain(config), "alignment": alignment.to_dict()}
     return trainer.step, trainer.state(), header

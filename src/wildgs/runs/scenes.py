@@ -1,4 +1,4 @@
-"""Compares the scene that a run carries with the scene folder that it is used with."""
+"""Compares the scene stored in a run with a scene folder."""
 
 from __future__ import annotations
 
@@ -25,29 +25,28 @@ def require_same_scene(folder: Path, scene: Scene) -> None:
         same = all(_alike(alignment, scene.alignment) for alignment in alignments)
     if not same:
         raise UserError(
-            f"{folder} was trained on another scene than {scene.root}; give the scene that it was trained on, "
-            "or choose another --output"
+            f"{folder} was trained on another scene than {scene.root}; give that scene, or choose another --output"
         )
 
 
 def _alike(one: Alignment, other: Alignment) -> bool:
-    """Whether two alignments may be of one scene, with some photos more or less."""
+    """Whether two alignments may belong to the same scene with some photos added or removed."""
     rotation = float((one.rotation - other.rotation).abs().max())
     return rotation < 0.05 and abs(one.scale / other.scale - 1) < 0.05
 
 
 def adopt_scene(record: SceneRecord, found: Scene, folder: Path) -> Scene:
-    """The run's own scene with the photos of a folder; one warning says what differs.
+    """Combines the scene stored in a run with the photos of a scene folder; a warning lists differences.
 
     Raises:
-        UserError: The folder holds another scene.
+        UserError: The folder contains another scene.
     """
     if not record.is_of(found):
-        raise UserError(f"{found.root} is another scene than the one that {folder} was trained on")
+        raise UserError(f"{found.root} is not the scene that {folder} was trained on; give that scene")
     scene, differences = record.adopt(found)
     if differences:
         warnings.warn(
-            f"{found.root} is not as it was when {folder} was trained: {'; '.join(differences)}",
+            f"{found.root} has changed since {folder} was trained: {'; '.join(differences)}",
             WildGSWarning,
             stacklevel=3,
         )
@@ -55,7 +54,7 @@ def adopt_scene(record: SceneRecord, found: Scene, folder: Path) -> Scene:
 
 
 def carried_record(folder: Path, scene: Scene, progress: Counter | None) -> SceneRecord:
-    """What the run carries of its scene; written first where an earlier version began the run."""
+    """The scene stored in a run; stored now if an earlier version created the run."""
     require_same_scene(folder, scene)
     if not (folder / SCENE_FILE).is_file():
         carry_scene(folder, scene, progress)

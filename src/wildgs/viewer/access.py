@@ -1,10 +1,10 @@
-"""Access control: a random token, Host and Origin headers, and the messages that browsers may send.
+"""Access control: a random token, checks of the Host and Origin headers, and validation of messages.
 
-The token keeps out everyone who was not given the address. Host is checked against DNS rebinding (a name of
-another site that resolves to this machine), Origin against pages of other sites that connect from a user's browser.
-viser sets whatever attribute a message names to whatever value it carries: only messages that the viewer's own page
-sends reach it, with finite numbers and values that the control can take. Others are dropped; a connection that
-sends something that is no message at all is closed.
+Only browsers with the token in their URL are served. The Host header is checked against DNS rebinding (a foreign
+host name that resolves to this machine), the Origin header against connections from pages of other sites. viser
+assigns any value in a message to any attribute that it names, so only messages that the viewer's page sends are
+passed on, with finite numbers and values that the control allows. Other messages are dropped; a connection that
+sends invalid data is closed.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ TOKEN_BYTES = 24
 
 
 class AccessControl:
-    """Decides which requests the viewer answers; `token` is the first segment of every path that is served."""
+    """Decides which requests the viewer answers; `token` is the first segment of every served path."""
 
     def __init__(self, host: str, token: str | None = None) -> None:
-        """Takes the address that the server listens on; without a token, makes a random one."""
+        """Creates the access control of a server that listens on `host`; the default token is random."""
         self.token = token or secrets.token_urlsafe(TOKEN_BYTES)
         self._loopback_only = is_loopback(host)
         self._names = {"localhost", *(() if self._loopback_only else own_names(host))}
@@ -34,22 +34,24 @@ class AccessControl:
         self._names.add(name.lower())
 
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> str | None:
-        """Why a request is refused, None if it is accepted.
+        """The reason why a request is refused; None if it is accepted.
 
-        `path` has the token as its first segment; `hosts` and `origins` are all values of these headers. Browsers
-        send an Origin with every WebSocket handshake.
+        Args:
+            path: Path of the request, with the token as its first segment.
+            hosts: All values of the Host header.
+            origins: All values of the Origin header, which browsers send with every WebSocket handshake.
         """
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return "the Host header does not name this machine; use its IP address or its own name"
         if len(origins) > 1 or (origins and not self._same_origin(origins[0], hosts[0])):
             return "requests from pages of other sites are not accepted"
-        given = _first_segment(path).encode("utf-8", "surrogatepass")  # paths may hold any bytes
+        given = _first_segment(path).encode("utf-8", "surrogatepass")  # paths may contain any bytes
         if not secrets.compare_digest(given, self.token.encode()):
-            return "the address needs the viewer's token; copy it whole from the terminal that shows it"
+            return "the viewer's token is missing or wrong; copy the complete URL from the terminal"
         return None
 
     def without_token(self, path: str) -> str:
-        """The path of an accepted request as the server behind it knows it."""
+        """The path of an accepted request without the token, for viser's server."""
         return path[1 + len(self.token) :] or "/"
 
     def _is_own(self, host: str) -> bool:
@@ -61,7 +63,7 @@ class AccessControl:
             return False
         if name in self._names:
             return True
-        # An address cannot be rebound, so any will do where the server listens to the network.
+        # DNS rebinding needs a name, so any IP address is accepted if the server listens on the network.
         return is_loopback(name) if self._loopback_only else _is_address(name)
 
     @staticmethod
@@ -75,7 +77,7 @@ def is_loopback(host: str) -> bool:
 
 
 def own_names(host: str) -> set[str]:
-    """Names under which browsers in the network may know this machine."""
+    """Host names by which browsers in the network may address this machine."""
     name = socket.gethostname().lower()
     return {name, f"{name}.local", socket.getfqdn().lower(), host.lower()} - {""}
 
@@ -93,26 +95,26 @@ def _first_segment(path: str) -> str:
 
 
 MAX_MESSAGE_BYTES = 4 * 2**20
-"""Of one message; parts of uploads are 512 KiB."""
+"""Largest message; parts of uploads have 512 KiB."""
 MAX_COORDINATE = 1e6
-"""Of cameras and clicks, in scene units."""
+"""Largest coordinate of cameras and clicks, in scene units."""
 MAX_WINDOW = 16_384
-"""Pixels of a browser's window along one side."""
+"""Largest width and height of a browser's window in pixels."""
 MAX_TEXT = 1000
 
 FindControl = Callable[[str], Any]
-"""The handle of a control on the page by its id, None where there is none."""
+"""Returns the handle of the control with an id, or None."""
 
 
 class MalformedMessageError(Exception):
-    """Bytes that are not a message of viser's protocol."""
+    """Data that is not a message of viser's protocol."""
 
 
 def decode(raw: object) -> dict[str, Any]:
-    """A message as a dictionary.
+    """Decodes a message.
 
     Raises:
-        MalformedMessageError: It is not a MessagePack map with a type.
+        MalformedMessageError: The data is not a MessagePack map with a type.
     """
     import msgspec
 
@@ -128,7 +130,7 @@ def decode(raw: object) -> dict[str, Any]:
 
 
 def is_acceptable(message: Mapping[str, Any], find_control: FindControl) -> bool:
-    """Whether viser may act on a message."""
+    """Whether a message may be passed on to viser."""
     fields = {name: value for name, value in message.items() if name != "type"}
     match message["type"]:
         case "GuiUpdateMessage":
@@ -151,7 +153,7 @@ def _good_update(fields: Mapping[str, Any], find_control: FindControl) -> bool:
 
 
 def _fits(value: Any, control: Any) -> bool:
-    """Whether a control can take a value; controls of other kinds take none."""
+    """Whether a control allows a value; False for other types of controls."""
     import viser
 
     if getattr(control, "disabled", False):
@@ -182,7 +184,7 @@ def _good_click(fields: Mapping[str, Any]) -> bool:
 
 
 def _has(fields: Mapping[str, Any], kinds: Mapping[str, Any]) -> bool:
-    """Whether a message has these fields of these types and no others, and no long text."""
+    """Whether a message has exactly these fields with these types, and no long text."""
     if set(fields) != set(kinds) or not all(isinstance(fields[name], kind) for name, kind in kinds.items()):
         return False
     return all(len(value) <= MAX_TEXT for value in fields.values() if isinstance(value, str))

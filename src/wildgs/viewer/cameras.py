@@ -1,4 +1,4 @@
-"""Between viser's cameras (a place, a quaternion, a vertical field of view) and ours."""
+"""Conversion between viser's cameras (position, quaternion, vertical field of view) and `Camera`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from wildgs.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class Pose:
-    """A camera as viser has it; axes are OpenCV's, as ours.
+    """A camera in viser's representation, with OpenCV axes.
 
     Attributes:
         wxyz: Camera-to-world rotation.
-        position: The camera's centre, world units.
+        position: Camera centre, world units.
         fov: Vertical field of view, radians.
-        aspect: Width over height.
+        aspect: Aspect ratio, width / height.
     """
 
     wxyz: Float[np.ndarray, " 4"]
@@ -32,7 +32,7 @@ class Pose:
 
 
 def pose_of(camera: Camera) -> Pose:
-    """Our camera as viser's, whose optical axis always goes through the picture's middle."""
+    """Converts a camera to viser's, whose principal point is always the centre of the image."""
     rotation = camera.viewmat[:3, :3].T.double().cpu().numpy()
     xyzw = Rotation.from_matrix(rotation).as_quat()
     return Pose(
@@ -44,9 +44,12 @@ def pose_of(camera: Camera) -> Pose:
 
 
 def camera_of(camera: Any, height: int, aspect: float | None = None) -> Camera:
-    """The camera of a client (`viser.CameraHandle`) or a `Pose` as ours, for a picture of a height in pixels.
+    """Converts the camera of a client (`viser.CameraHandle`) or a `Pose`.
 
-    `aspect` is width over height; None keeps the camera's.
+    Args:
+        camera: The camera.
+        height: Height of the image in pixels.
+        aspect: Aspect ratio, width / height; None keeps the camera's.
     """
     width = max(1, round(height * (aspect or camera.aspect)))
     w, x, y, z = (float(value) for value in camera.wxyz)
@@ -60,6 +63,6 @@ def camera_of(camera: Any, height: int, aspect: float | None = None) -> Camera:
 
 
 def fov_that_holds(pose: Pose, aspect: float) -> float:
-    """The vertical field of view at which a window of another aspect shows all that the camera sees."""
+    """The vertical field of view at which a window of another aspect ratio shows the camera's whole image."""
     half = math.tan(pose.fov / 2)
     return 2 * math.atan(half * max(1.0, pose.aspect / aspect))

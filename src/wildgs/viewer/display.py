@@ -1,4 +1,4 @@
-"""The Gaussians in the browser: sent once, recoloured when the light or the viewpoint changes."""
+"""The Gaussians in the browser; their colours are updated when the light or the viewpoint changes."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ if TYPE_CHECKING:
     import viser
 
 ENLARGED = 10.0
-"""Factor on the sizes of splats, which their scene node undoes: covariances are sent in half precision, which is
-coarse below 6e-5, and a Gaussian as wide as a pixel at the photos' median depth has a variance of 1e-6."""
+"""Scale factor of splats, undone by their scene node. Covariances are sent in half precision, which is coarse below
+6e-5, while a Gaussian of one pixel at the photos' median depth has a variance of 1e-6."""
 
 _HALF_MAX = 6e4
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Geometry as viser takes it, enlarged by `ENLARGED`.
+    """Geometry for viser, scaled by `ENLARGED`.
 
     Attributes:
-        rows: Which Gaussians these are; those that no picture shows are left out.
-        means: Their centres in the aligned frame, for colours that depend on the direction; on the method's device.
-        centers: The same, enlarged.
-        covariances: World axes, enlarged.
-        opacities: In [0, 1].
+        rows: Indices of the Gaussians; invisible ones are left out.
+        means: Centres in the aligned frame on the method's device, for evaluating view-dependent colours.
+        centers: Scaled centres.
+        covariances: Scaled covariances in world axes.
+        opacities: Opacities in [0, 1].
     """
 
     rows: Int[Tensor, " M"]
@@ -53,7 +53,7 @@ class Splats:
 
 @torch.no_grad()
 def splats_of(gaussians: Gaussians) -> Splats:
-    """Packs all Gaussians that can be seen: finite, and with an opacity of at least 1/255 as in the rasteriser."""
+    """Packs all visible Gaussians: finite, and with an opacity of at least 1/255 as in the rasteriser."""
     scales, opacities = gaussians.scales, gaussians.opacities
     finite = gaussians.means.isfinite().all(dim=1) & scales.isfinite().all(dim=1)
     finite &= gaussians.quats.isfinite().all(dim=1)
@@ -74,7 +74,7 @@ def splats_of(gaussians: Gaussians) -> Splats:
 def colors_from(
     means: Float[Tensor, "M 3"], sh: Float[Tensor, "M K 3"], position: Float[Tensor, " 3"], degree: int
 ) -> Float[np.ndarray, "M 3"]:
-    """Colours in [0, 1] of Gaussians with these centres as seen from a position, by harmonics up to a degree."""
+    """Colours in [0, 1] of Gaussians seen from a position, by harmonics up to a degree."""
     viewmat = torch.eye(4).to(means)
     viewmat[:3, 3] = -position.to(means)
     camera = Camera(viewmat, torch.eye(3).to(means), 1, 1)
@@ -94,12 +94,12 @@ NODE = "/splats"
 class SplatDisplay:
     """Draws a subject's Gaussians in all clients.
 
-    viser's splats have one colour each. Colours that depend on the direction are evaluated for one position, that
-    of the camera that moved last, and are exact there for all directions.
+    viser's splats have one colour each, so view-dependent colours are evaluated for the position of the camera that
+    moved last.
 
     Attributes:
-        eye: The position for which colours are evaluated, aligned frame.
-        paint: What colours show.
+        eye: The position for which colours are evaluated, in the aligned frame.
+        paint: Whether splats show colour or depth.
     """
 
     def __init__(self, server: viser.ViserServer, subject: Subject, eye: Float[Tensor, " 3"]) -> None:
@@ -114,7 +114,7 @@ class SplatDisplay:
 
     @torch.no_grad()
     def show(self, look: Look) -> None:
-        """Draws all Gaussians under a light of the subject's present state."""
+        """Draws all Gaussians under a look of the subject's current state."""
         if self._splats is None or self._version != self._subject.version:
             self._version = self._subject.version
             self._splats = splats_of(self._subject.method.gaussians)
@@ -122,7 +122,7 @@ class SplatDisplay:
         self.repaint()
 
     def repaint(self) -> None:
-        """Evaluates colours for the eye and sends them; the subject may have changed since `show`."""
+        """Evaluates the colours for `eye` and sends them; the subject may have changed since `show`."""
         if self._splats is None or self._sh is None:
             return
         colors = self._colors(self._splats, self._sh)

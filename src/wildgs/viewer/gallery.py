@@ -1,4 +1,4 @@
-"""The photos that are offered at a glance: thumbnails, and masks over them, made a few at a time."""
+"""Thumbnails of photos and masks over them, computed a few at a time."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from wildgs.scene import View
 from wildgs.viewer.markup import jpeg_uri, thumbnail
 
 AT_ONCE = 4
-"""Photos decoded in one go: others wait for the same thread."""
+"""Number of photos per call, since other jobs wait for the same thread."""
 
 
 def spread(views: Sequence[View], count: int) -> tuple[View, ...]:
-    """At most `count` views, evenly spread over their names."""
+    """An even selection of at most `count` views."""
     count = min(count, len(views))
     return tuple(views[index * len(views) // count] for index in range(count))
 
@@ -28,7 +28,7 @@ class Gallery:
     """Thumbnails of some photos, by name.
 
     Attributes:
-        masks: Whether thumbnails show what the mask M hides, in red.
+        masks: Whether thumbnails show in red what the mask M hides.
     """
 
     def __init__(self, views: Sequence[View]) -> None:
@@ -42,11 +42,11 @@ class Gallery:
         self._listeners: list[Callable[[], None]] = []
 
     def on_change(self, listener: Callable[[], None]) -> None:
-        """Calls a function whenever thumbnails were added."""
+        """Registers a function that is called whenever thumbnails are added."""
         self._listeners.append(listener)
 
     def load_some(self) -> bool:
-        """Decodes the next few photos; False once there is nothing left. Photos that do not open are left out."""
+        """Decodes the next few photos, skipping unreadable ones; returns whether photos are left."""
         chosen, self._waiting = self._waiting[:AT_ONCE], self._waiting[AT_ONCE:]
         for view in chosen:
             try:
@@ -60,16 +60,16 @@ class Gallery:
         return bool(self._waiting)
 
     def show_masks(self, shown: bool) -> None:
-        """Shows photos with or without masks; masks are computed anew by `mask_some`."""
+        """Shows photos with or without masks, which `mask_some` computes."""
         self.masks = shown
         self._unmasked = list(self.views) if shown else []
         self._announce()
 
     def mask_some(self, visibility: Callable[[View], Float[Tensor, "_ _"] | None]) -> bool:
-        """Lays M over the next few thumbnails; False once there is nothing left.
+        """Computes the next few thumbnails with masks; returns whether photos are left.
 
         Args:
-            visibility: M of a photo, 1 = static.
+            visibility: Returns the mask M of a photo, 1 = static.
 
         Raises:
             UserError: The method predicts no masks.
@@ -96,14 +96,14 @@ class Gallery:
             listener()
 
     def sources(self) -> list[tuple[str, str]]:
-        """Name and data URI of every thumbnail there is."""
+        """Name and data URI of every loaded thumbnail."""
         masked = self._masked if self.masks else {}
         return [(name, masked[name][1] if name in masked else uri) for name, uri in self._sources.items()]
 
     def picture(self, name: str) -> UInt8[np.ndarray, "h w 3"] | None:
-        """A photo's thumbnail, where there is one yet."""
+        """A photo's thumbnail; None if it is not loaded yet."""
         return self._masked[name][0] if self.masks and name in self._masked else self._pictures.get(name)
 
     def mean_colors(self) -> dict[str, np.ndarray]:
-        """Mean RGB of every thumbnail there is."""
+        """Mean RGB of every loaded thumbnail."""
         return {name: picture.reshape(-1, 3).mean(axis=0) for name, picture in self._pictures.items()}

@@ -1,8 +1,9 @@
-"""viser's server behind access control and checks of what browsers send; viser itself has neither.
+"""viser's server with access control and validation of messages, neither of which viser has.
 
-viser 1.1 starts its HTTP and WebSocket server by `websockets.asyncio.server.serve` without offering a hook. While
-a `GuardedServer` is made, that function adds the hooks that websockets documents: `process_request` for access
-control and `create_connection` for incoming messages. If they did not take effect, the server is stopped at once.
+viser 1.1 starts its HTTP and WebSocket server by `websockets.asyncio.server.serve` and offers no hook. While a
+`GuardedServer` is constructed, that function is replaced by one that adds the hooks documented by websockets:
+`process_request` for access control and `create_connection` for incoming messages. If the replacement was not
+called, the server is stopped at once.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from wildgs.viewer.uploads import Upload, Uploads
 POLICY_VIOLATION = 1008
 """WebSocket close code."""
 PRIVACY_HEADERS = {
-    "Referrer-Policy": "no-referrer",  # the address holds the token
+    "Referrer-Policy": "no-referrer",  # the URL contains the token
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
@@ -48,17 +49,17 @@ class GuardedServer(viser.ViserServer):
     """A viser server that answers only requests with its token, and acts only on valid messages."""
 
     def __init__(self, host: str, port: int, *, share: bool = False) -> None:
-        """Starts the server on the first free port from `port` on; `share` allows a public address by viser.
+        """Starts the server on the first free port from `port` on; `share` allows a public URL by viser's relay.
 
         Raises:
-            UserError: The installed viser cannot be guarded.
+            UserError: The installed version of viser is not supported.
         """
         self.access = AccessControl(host)
         self.uploads = Uploads(_BrowserReplies(self))
         self._may_share = share
-        with _hooks(self.access, self._passes, self.uploads.drop) as taken:
+        with _hooks(self.access, self._passes, self.uploads.drop) as calls:
             super().__init__(host=host, port=port, verbose=False)
-        if not taken:
+        if not calls:
             self.stop()
             raise UserError(
                 f"viser {viser.__version__} is not supported, because its server cannot be protected: "
@@ -66,7 +67,7 @@ class GuardedServer(viser.ViserServer):
             )
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Public address of viser's relay; browsers ask for it, too, and get none unless sharing was asked for."""
+        """The public URL of viser's relay; None unless sharing is on, also when a browser requests it."""
         return super().request_share_url(verbose) if self._may_share else None
 
     def stop(self) -> None:
@@ -75,10 +76,10 @@ class GuardedServer(viser.ViserServer):
         super().stop()
 
     def _passes(self, connection: ServerConnection, raw: object) -> bool:
-        """Whether viser gets a message; uploads are received here instead.
+        """Handles a message of an upload; else, whether the message may be passed on to viser.
 
         Raises:
-            MalformedMessageError: It is no message.
+            MalformedMessageError: The data is not a message.
         """
         message = decode(raw)
         if message["type"] == "FileTransferStartUpload":
@@ -90,7 +91,7 @@ class GuardedServer(viser.ViserServer):
         return False
 
     def client_of(self, connection: Hashable) -> viser.ClientHandle | None:
-        """The browser at the other end of a connection, None once it has left."""
+        """The client of a connection; None if it has disconnected."""
         for number, live in list(self._websock_server._live_connections.items()):
             if live is connection:
                 return self.get_clients().get(number)
@@ -98,7 +99,7 @@ class GuardedServer(viser.ViserServer):
 
 
 class _BrowserReplies:
-    """Answers to uploads in the messages that viser's page understands."""
+    """Replies to uploads by messages of viser's protocol."""
 
     def __init__(self, server: GuardedServer) -> None:
         self._server = server
@@ -112,7 +113,7 @@ class _BrowserReplies:
         client = self._server.client_of(connection)
         if client is None:
             return
-        # The page calls every upload whose bytes have arrived a success: its notification goes first.
+        # The page reports success when all bytes are acknowledged, so its notification is removed first.
         queue = client._websock_connection.queue_message
         queue(_messages.RemoveNotificationMessage(uuid=f"upload-{upload.transfer}"))
         client.flush()
@@ -133,13 +134,13 @@ def _hooks(
     passes: Callable[[ServerConnection, object], bool],
     left: Callable[[Hashable], None],
 ) -> Iterator[list[bool]]:
-    """Adds access control and message checks to the server that viser starts in the meantime.
+    """Adds access control and validation of messages to the server that viser starts in the block.
 
     Yields:
-        A list that is not empty once they are in effect.
+        A list that is not empty if such a server was started.
     """
     module: Any = websockets.asyncio.server
-    original, taken = module.serve, []
+    original, calls = module.serve, []
 
     def serve(handler: Callable[..., Any], *positional: Any, **options: Any) -> Any:
         if not str(handler.__module__).startswith("viser."):
@@ -148,13 +149,13 @@ def _hooks(
         options["create_connection"] = _connection_type(passes, left)
         options["max_size"] = MAX_MESSAGE_BYTES
         options["logger"] = _quiet_logger()
-        taken.append(True)
+        calls.append(True)
         return original(handler, *positional, **options)
 
     with _hook_lock:
         module.serve = serve
         try:
-            yield taken
+            yield calls
         finally:
             module.serve = original
 
@@ -190,7 +191,7 @@ def _connection_type(
     passes: Callable[[ServerConnection, object], bool], left: Callable[[Hashable], None]
 ) -> type[ServerConnection]:
     class CheckedConnection(ServerConnection):
-        """A connection from which viser receives only messages that pass."""
+        """A connection that passes only valid messages on to viser."""
 
         async def recv(self, decode: bool | None = None) -> Any:
             while True:
@@ -209,7 +210,7 @@ def _connection_type(
 
 
 def _quiet_logger() -> logging.Logger:
-    """Websockets prints a traceback for every handshake that fails, as those of port scanners do."""
+    """A logger without tracebacks of failed handshakes, which port scanners cause."""
     logger = logging.getLogger("wildgs.viewer.connections")
     if not logger.filters:
         logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")

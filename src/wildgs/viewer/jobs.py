@@ -1,4 +1,4 @@
-"""The queue of the viewer's work, done by a thread of its own or between training steps."""
+"""The viewer's job queue, processed by a worker thread or between training steps."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Job = Callable[[], None]
 
 
 class Jobs:
-    """A queue in which a job replaces an older one of its kind: a slider sends more values than can be shaded.
+    """A queue in which a job replaces an older one of the same kind, such as an outdated slider value.
 
-    All work on the method goes through one such queue and is done by one thread: a worker's, or the trainer's.
+    All work on the method goes through one queue and is done by one thread, a worker's or the trainer's.
     """
 
     def __init__(self) -> None:
@@ -24,14 +24,14 @@ class Jobs:
         self._closed = False
 
     def put(self, kind: str, job: Job) -> None:
-        """Adds a job, unless the queue is closed."""
+        """Adds a job unless the queue is closed."""
         with self._changed:
             if not self._closed:
                 self._waiting[kind] = job
                 self._changed.notify()
 
     def take(self, *, wait: bool) -> Job | None:
-        """The next job, None if there is none; with `wait`, only once the queue is closed."""
+        """The next job; None if there is none or, with `wait`, if the queue is closed."""
         with self._changed:
             while wait and not self._waiting and not self._closed:
                 self._changed.wait()
@@ -46,9 +46,9 @@ class Jobs:
 
 
 def start_worker(jobs: Jobs) -> threading.Thread:
-    """Does jobs on a thread of its own, which ends after the present job once the queue is closed.
+    """Starts a thread that does jobs until the queue is closed.
 
-    A program must join it: a thread that Python stops in the middle of a kernel crashes the process.
+    The caller must join it, because a thread that Python stops inside a kernel crashes the process.
     """
 
     def work() -> None:
@@ -61,16 +61,15 @@ def start_worker(jobs: Jobs) -> threading.Thread:
 
 
 SHARE = 0.03
-"""Share of the time that jobs may take; with viser's own thread, which sends their results, the viewer stays
-below 5%."""
+"""Fraction of the time that jobs may take. Together with viser's own thread the viewer takes less than 5%."""
 UPDATE_SECONDS = 3.0
 
 
 class TrainingTurns:
     """An observer of training that does the viewer's jobs between steps, on the trainer's thread.
 
-    A job that took t seconds is followed by a rest of t (1 - share) / share, so that jobs never take more than that
-    share of the time, whatever clients request.
+    A job that took t seconds is followed by a pause of t (1 - share) / share, so that jobs never take more than
+    that fraction of the time, whatever clients request.
     """
 
     def __init__(
@@ -83,15 +82,15 @@ class TrainingTurns:
         every: float = UPDATE_SECONDS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Sets what to do and when.
+        """Creates the observer.
 
         Args:
             jobs: The queue.
             watched: Whether any client is connected.
-            update: Queues an update to the present step.
-            share: Share of the time that jobs may take.
-            every: Least time between updates, seconds.
-            clock: Time in seconds.
+            update: Queues an update to the current step.
+            share: Fraction of the time that jobs may take.
+            every: Smallest time between updates, seconds.
+            clock: Returns the time in seconds.
         """
         self.seconds = 0.0
         self._jobs, self._watched, self._update = jobs, watched, update
@@ -99,7 +98,7 @@ class TrainingTurns:
         self._rest_until = self._next_update = clock()
 
     def __call__(self, report: StepReport) -> None:
-        """Does one job, if its time has come."""
+        """Does at most one job."""
         now = self._clock()
         if now < self._rest_until or not self._watched():
             return

@@ -1,4 +1,4 @@
-"""The light: two photos or uploaded pictures, and a slider that interpolates between them."""
+"""The light controls: two photos or uploaded images, and a slider that interpolates between them."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
 
 MAX_UPLOAD_PIXELS = 50_000_000
-"""Of an uploaded picture; a file of a few hundred kB can hold hundreds of megapixels."""
+"""Largest uploaded image; a file of a few hundred kB can contain hundreds of megapixels."""
 UPLOAD_SIDE = 2048
-"""Uploaded pictures are kept no larger: they are encoded much smaller."""
+"""Longest side to which uploaded images are reduced; their embedding needs much less."""
 KEPT_UPLOADS = 16
-"""Files of uploaded pictures that are kept; older ones are deleted."""
+"""Number of uploaded images that are kept; older ones are deleted."""
 SIDES = ("Left", "Right")
-"""Ends of the slider: a click on a photo gives its light to the chosen one."""
+"""Ends of the slider; a click on a photo assigns its light to the selected end."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """A light: what `LightSources.find` takes, a label, and the photo whose camera a picture borrows."""
+    """A light: arguments of `LightSources.find`, and a label."""
 
     spec: str
     label: str
@@ -54,31 +54,31 @@ class Light:
 
 @dataclass(frozen=True)
 class LightDesk:
-    """Two lights and the position of the slider between them: 0 is the first one, 1 the second."""
+    """Two lights and the position of the slider between them: 0 is the first, 1 the second."""
 
     first: Light
     second: Light
     amount: float = 0.0
 
     def with_light(self, light: Light, side: str) -> LightDesk:
-        """The desk with another light on one side, and the slider moved there."""
+        """Replaces the light on one side and moves the slider there."""
         if side == SIDES[0]:
             return replace(self, first=light, amount=0.0)
         return replace(self, second=light, amount=1.0)
 
     @classmethod
     def at_hour(cls, day: Sequence[str], share: float) -> LightDesk:
-        """The desk at a share of a day: between two of the photos that show it, at least two, in order."""
+        """Two neighbouring photos of a day (at least two photos, in order) at a fraction of it."""
         position = min(max(share, 0.0), 1.0) * (len(day) - 1)
         index = min(int(position), len(day) - 2)
         before, after = (Light(name, name) for name in day[index : index + 2])
         return cls(before, after, position - index)
 
     def look(self, subject: Subject) -> Look:
-        """The mixed light; encodes a photo only when its light is needed.
+        """The mixed light; embeds only the photos that it depends on.
 
         Raises:
-            UserError: A light cannot be found.
+            UserError: A light cannot be obtained.
         """
         if self.amount <= 0:
             return subject.look(self.first.spec, self.first.like)
@@ -89,7 +89,7 @@ class LightDesk:
 
 
 class LightPanel:
-    """The controls of a desk."""
+    """The controls of a `LightDesk`."""
 
     def __init__(
         self,
@@ -105,12 +105,12 @@ class LightPanel:
 
         Args:
             server: The viewer's server.
-            desk: The lights to begin with.
+            desk: The initial lights.
             gallery: Photos to choose from.
             changed: Called on a thread of viser after the desk changed.
-            lender: Names the photo whose camera a picture borrows.
-            masks_asked: Called, likewise, when masks over the photos are switched on or off.
-            day: Names of the photos that show a day, in order; empty where no day is known.
+            lender: Returns the name of the photo whose camera and depth an uploaded image uses.
+            masks_asked: Called on a thread of viser when masks over the photos are switched on or off.
+            day: Names of the photos of a day, in order; empty if the day is not known.
         """
         self.desk = desk
         self._server, self._gallery = server, gallery
@@ -120,23 +120,25 @@ class LightPanel:
         self.touched = False
         gui = server.gui
         self._side = gui.add_button_group(
-            "Photo goes", SIDES, hint="Which end of the slider a photo is given to"
+            "Assign photo to", SIDES, hint="End of the slider that a click on a photo changes"
         )
         self._sheet = gui.add_html("")
         self._buttons = {name: self._add_button(name) for name in gallery.names}
         self.masks = gui.add_checkbox(
-            "Masks over photos", gallery.masks, hint="Red is what the mask of a photo hides, as passers-by"
+            "Show masks",
+            gallery.masks,
+            hint="Red areas of a photo, such as passers-by, are hidden by its mask",
         )
         self.masks.on_update(lambda _: masks_asked(self.masks.value))
         self._slider = gui.add_slider("Mix", 0.0, 1.0, 0.01, desk.amount)
         if len(day) > 1:
             self._hour = gui.add_slider(
-                "Day", 0.0, 1.0, 0.002, 0.0, hint="From the first light of a day to the last"
+                "Day", 0.0, 1.0, 0.002, 0.0, hint="Time of day, from the first photo to the last"
             )
             self._hour.on_update(lambda _: self.set_hour(day, self._hour.value))
         self._frames = gui.add_html("")
         self._pair = gui.add_html("")
-        self._upload = gui.add_upload_button("A picture of your own", mime_type="image/*")
+        self._upload = gui.add_upload_button("Upload an image", mime_type="image/*")
         gui.add_html(drop_zone(element_id(self._upload)))
         self._slider.on_update(lambda _: self.set_amount(self._slider.value))
         server.uploads.receive(element_id(self._upload), self.take_picture)
@@ -150,29 +152,29 @@ class LightPanel:
         return button
 
     def choose(self, light: Light) -> None:
-        """Gives a light to the side that is chosen."""
+        """Assigns a light to the selected side."""
         self.touched = True
         self._set(self.desk.with_light(light, self._side.value))
 
     def suggest(self, first: str, second: str) -> None:
-        """Takes two photos' lights, unless someone has chosen already."""
+        """Sets the lights of two photos, unless a user has changed them already."""
         if not self.touched:
             self._set(LightDesk(Light(first, first), Light(second, second)))
 
     def set_amount(self, amount: float) -> None:
-        """Moves along the slider."""
+        """Sets the position of the slider."""
         if math.isfinite(amount) and amount != self.desk.amount:
             self.touched = True
             self._set(replace(self.desk, amount=min(max(float(amount), 0.0), 1.0)))
 
     def set_hour(self, day: Sequence[str], share: float) -> None:
-        """Moves along the day."""
+        """Sets the time of day."""
         if math.isfinite(share):
             self.touched = True
             self._set(LightDesk.at_hour(day, share))
 
     def take_picture(self, name: str, content: bytes) -> None:
-        """Gives the light of a picture that a browser sent to the chosen side; `UserError` if it cannot be used."""
+        """Assigns the light of an uploaded image to the selected side; `UserError` if it cannot be used."""
         self._number += 1
         folder = Path(self._uploads.name)
         file = store_upload(folder, self._number, name, content)
@@ -191,7 +193,7 @@ class LightPanel:
         self._changed()
 
     def take_back(self, desk: LightDesk) -> None:
-        """Restores an earlier desk: a light could not be found."""
+        """Restores an earlier desk after a light could not be obtained."""
         self.desk = desk
         self._slider.value = desk.amount
         self._refresh()
@@ -205,7 +207,7 @@ class LightPanel:
         )
 
     def _refresh(self) -> None:
-        """Shows which lights are chosen, and how much of each."""
+        """Shows which lights are selected and their weights."""
         desk = self.desk
         buttons = [self._buttons.get(light.spec) for light in (desk.first, desk.second)]
         self._frames.content = chosen_frames(
@@ -214,15 +216,15 @@ class LightPanel:
         self._pair.content = light_pair(desk.first.label, desk.second.label, desk.amount)
 
     def close(self) -> None:
-        """Deletes uploaded pictures."""
+        """Deletes uploaded images."""
         self._uploads.cleanup()
 
 
 def store_upload(folder: Path, number: int, name: str, content: bytes) -> Path:
-    """Decodes a picture that a browser sent, and writes it small to a folder, under its number and a plain name.
+    """Decodes an uploaded image and writes it, reduced, to a folder under a safe and unique name.
 
     Raises:
-        UserError: It cannot be read, or has too many pixels.
+        UserError: The image cannot be read or stored, or has too many pixels.
     """
     stem = re.sub(r"[^A-Za-z0-9]+", "-", Path(name.replace("\\", "/")).stem).strip("-")[:40]
     received = folder / f"received-{number}"
@@ -232,7 +234,7 @@ def store_upload(folder: Path, number: int, name: str, content: bytes) -> Path:
     except UnreadableImageError as error:
         raise UserError(str(error).replace(" (--max-image-pixels)", "")) from error
     except OSError as error:
-        raise UserError(f"it cannot be stored ({error.strerror}); free disk space") from error
+        raise UserError(f"the image cannot be stored ({error.strerror}); free disk space") from error
     finally:
         received.unlink(missing_ok=True)
     picture.thumbnail((UPLOAD_SIDE, UPLOAD_SIDE), Image.Resampling.LANCZOS, reducing_gap=2.0)

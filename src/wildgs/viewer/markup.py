@@ -1,4 +1,4 @@
-"""Pieces of HTML for viser's panels. Whatever comes from outside (file names) is escaped here."""
+"""HTML for viser's panels; file names are escaped here."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from wildgs.files import printable
 
 THUMBNAIL_SIDE = 96
 CHOSEN_COLORS = ("#4dabf7", "#ffa94d")
-"""Frames of the first and the second light's thumbnail."""
+"""Colours of the frames around the thumbnails of the first and the second light."""
 
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A photo that can be clicked: its name, a data URI, and the id of the button that a click goes to."""
+    """A clickable photo: its name, a data URI, and the id of the button that a click triggers."""
 
     name: str
     source: str
@@ -31,33 +31,33 @@ class Thumbnail:
 
 
 def escape(text: str) -> str:
-    """Text as it is, in HTML; what does not print, as escapes: the page is sent as UTF-8."""
+    """Escapes text for HTML; unprintable characters become visible escapes."""
     return html.escape(printable(text), quote=True)
 
 
 def element_id(handle: Any) -> str:
-    """The id that viser's client gives a button's element; viser has no public name for it."""
+    """The id of a button's HTML element; viser has no public attribute for it."""
     return handle._impl.uuid
 
 
 def jpeg_uri(picture: UInt8[np.ndarray, "H W 3"], quality: int = 85) -> str:
-    """A picture inside the page."""
+    """An image as a JPEG data URI."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="JPEG", quality=quality)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def thumbnail(photo: UInt8[Tensor, "H W 3"], side: int = THUMBNAIL_SIDE) -> UInt8[np.ndarray, "h w 3"]:
-    """The photo, no longer than `side`."""
+    """The photo, reduced to a longer side of at most `side` pixels."""
     image = Image.fromarray(photo.numpy())
     image.thumbnail((side, side), Image.Resampling.BICUBIC, reducing_gap=2.0)
     return np.asarray(image).copy()
 
 
 def contact_sheet(thumbnails: Sequence[Thumbnail]) -> str:
-    """Thumbnails in a grid; each is a label of a button, which is not shown itself.
+    """A grid of thumbnails; each is a label of a hidden button.
 
-    A label passes its click on without a script, so nothing that a photo is called can become one.
+    A label forwards clicks without a script, so that names of photos cannot inject code.
     """
     hidden = ",".join(f'div:has(> [id="{thumb.button}"])' for thumb in thumbnails)
     cells = "".join(
@@ -76,7 +76,7 @@ def contact_sheet(thumbnails: Sequence[Thumbnail]) -> str:
 def chosen_frames(buttons: Sequence[str | None]) -> str:
     """Frames around the thumbnails of the two lights, by the ids of their buttons (None without thumbnail).
 
-    Apart from the thumbnails themselves, which would scroll back to the top whenever they are sent again.
+    Separate from the grid, which would scroll back to the top whenever it is sent again.
     """
     rules = (
         f'label[for="{button}"] img{{outline:3px solid {color}}}'
@@ -87,7 +87,7 @@ def chosen_frames(buttons: Sequence[str | None]) -> str:
 
 
 def light_pair(first: str, second: str, amount: float) -> str:
-    """Which lights the slider goes between, in their frames' colours."""
+    """Names and weights of the two lights, in the colours of their frames."""
     names = (
         f'<span style="color:{color};overflow-wrap:anywhere">{escape(name)}</span>'
         for name, color in zip((first, second), CHOSEN_COLORS, strict=True)
@@ -101,7 +101,7 @@ def light_pair(first: str, second: str, amount: float) -> str:
 
 
 def figures(pictures: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"]]], note: str) -> str:
-    """Pictures two a row with captions, and a line below."""
+    """Images with captions in two columns, and a note below."""
     cells = "".join(
         '<figure style="margin:0"><img style="width:100%;display:block;border-radius:4px" '
         f'src="{jpeg_uri(picture)}" alt="{escape(caption)}">'
@@ -115,11 +115,11 @@ def figures(pictures: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"]]], note: st
 
 
 def drop_zone(upload_button: str) -> str:
-    """Shows the file input of viser's upload button, given by its id, as an area where files can be dropped."""
+    """Shows the file input of viser's upload button (its id) as an area where files can be dropped."""
     return (
         f'<style>[id="file_upload_{upload_button}"]{{display:block !important;box-sizing:border-box;width:100%;'
         "padding:18px 10px;margin-bottom:6px;border:1.5px dashed #868e96;border-radius:6px;font-size:12px;"
         f'color:inherit}}[id="{upload_button}"]{{display:none}}</style>'
-        '<div style="font-size:12px;opacity:.75;margin:2px 12px">Drop any picture here to light the scene as it '
-        "is lit</div>"
+        '<div style="font-size:12px;opacity:.75;margin:2px 12px">Drop any image here to light the scene like it</'
+        "div>"
     )

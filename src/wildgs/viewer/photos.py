@@ -1,4 +1,4 @@
-"""The photos in space: frustums, viewpoints, and each photo beside its render, mask and depth."""
+"""The photos in the scene: frustums, viewpoints, and comparisons of a photo with its render, mask and depth."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     import viser
 
 LONG_SIDE = 480
-"""Long side of the pictures, pixels."""
+"""Longer side of the images in pixels."""
 
 Picture = UInt8[np.ndarray, "H W 3"]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Pictures of one viewpoint, all of one size.
+    """Images of one viewpoint, all of the same size.
 
     Attributes:
-        name: The photo's.
-        photo: As it was taken.
-        render: The scene from there.
-        mask: The photo with red where the model takes it for transient; None without a mask.
-        depth: Near is bright.
-        psnr: Of the render against the photo, passers-by and all, in dB.
-        light: The name of the render's light.
+        name: Name of the photo.
+        photo: The photo.
+        render: Render of its viewpoint.
+        mask: The photo with transient pixels in red; None without a mask.
+        depth: Rendered depth; near is bright.
+        psnr: PSNR of the render against the whole photo including transients, dB.
+        light: Name of the render's light.
     """
 
     name: str
@@ -84,14 +84,14 @@ def _resized(channels: Float[Tensor, "C H W"], width: int, height: int) -> Float
 
 PARENT = "/photos"
 FRUSTUM_SIZE = 0.06
-"""Of a frustum, in the photos' usual depth."""
+"""Size of a frustum, relative to the photos' median depth."""
 LINE = 0.0012
 COLORS = {"train": (250, 176, 5), "test": (81, 207, 102)}
 NO_PHOTO = "choose…"
 
 
 class PhotoPanel:
-    """Frustums and their controls, and a window with a photo beside its render."""
+    """Frustums and their controls, and the comparison of a photo with its render."""
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class PhotoPanel:
         Args:
             server: The viewer's server.
             views: All photos.
-            gallery: Those that get frustums.
+            gallery: Photos with frustums.
             visited: Called on a thread of viser when a client moves to a photo's viewpoint.
         """
         self._server, self._gallery, self._visited = server, gallery, visited
@@ -114,29 +114,29 @@ class PhotoPanel:
         self._frustums: dict[str, viser.CameraFrustumHandle] = {}
         self._shown: dict[str, np.ndarray] = {}
         gui = server.gui
-        # Not shown at first: at a photo's viewpoint, the photos of others stand in the way.
+        # Initially hidden, because frustums of other photos block the view from a photo's viewpoint.
         self.parent = server.scene.add_frame(PARENT, show_axes=False, visible=False)
         shown = gui.add_checkbox(
-            "Show cameras", False, hint="Where photos were taken; a click on one goes there"
+            "Show cameras", False, hint="Show the cameras of the photos; click on one to move there"
         )
         shown.on_update(lambda _: setattr(self.parent, "visible", shown.value))
         self._choice = gui.add_dropdown("Go to photo", (NO_PHOTO, *self._by_label), initial_value=NO_PHOTO)
         self._choice.on_update(self._chosen)
         self.own_light = gui.add_checkbox(
-            "Under its own light",
+            "Use the photo's light",
             True,
-            hint="Otherwise the render is under the light that the scene is shown in",
+            hint="Otherwise the photo's viewpoint is rendered under the current light",
         )
         self.own_light.on_update(lambda _: self._revisit())
         self._pictures = gui.add_html(
             '<div style="font-size:12px;opacity:.75;margin:2px 12px 8px">Choose a photo above, or click its camera '
-            "in the scene, to stand where it was taken. Photo, render, mask and depth appear here.</div>"
+            "in the scene, to move to its viewpoint. Photo, render, mask and depth appear here.</div>"
         )
         gallery.on_change(self.refresh)
         self.refresh()
 
     def refresh(self) -> None:
-        """Adds frustums for the photos whose thumbnails are there, and shows those that changed."""
+        """Adds frustums for photos whose thumbnails are loaded, and updates changed thumbnails."""
         for view in self._gallery.views:
             picture = self._gallery.picture(view.name)
             if picture is None or picture is self._shown.get(view.name):
@@ -147,7 +147,7 @@ class PhotoPanel:
                 continue
             pose = pose_of(view.camera)
             frustum = self._server.scene.add_camera_frustum(
-                # Names of nodes make a tree at every slash; a number is safe whatever the photo is called.
+                # A number, because slashes in names of nodes create a hierarchy.
                 f"{PARENT}/{len(self._frustums)}",
                 fov=pose.fov,
                 aspect=pose.aspect,
@@ -162,7 +162,7 @@ class PhotoPanel:
             self._frustums[view.name] = frustum
 
     def visit(self, client: viser.ClientHandle | None, view: View) -> None:
-        """Moves a client's camera to a photo's viewpoint, and requests the comparison."""
+        """Moves a client's camera to a photo's viewpoint and requests the comparison."""
         if client is not None:
             stand_at(client, view)
         self.current = view
@@ -171,12 +171,12 @@ class PhotoPanel:
         self._visited(view)
 
     def show(self, comparison: Comparison) -> None:
-        """Shows pictures of the current photo's viewpoint."""
+        """Shows the images of the current photo's viewpoint."""
         pictures = [("photo", comparison.photo), ("render", comparison.render)]
         if comparison.mask is not None:
             pictures.append(("mask: red is transient", comparison.mask))
         pictures.append(("depth: near is bright", comparison.depth))
-        note = f"{comparison.name}, lit by {comparison.light}: {comparison.psnr:.1f} dB, passers-by included"
+        note = f"{comparison.name}, lit by {comparison.light}: {comparison.psnr:.1f} dB, including passers-by"
         self._pictures.content = figures(pictures, note)
 
     def _chosen(self, event: viser.GuiEvent) -> None:
@@ -190,7 +190,7 @@ class PhotoPanel:
 
 
 def stand_at(client: viser.ClientHandle, view: View) -> None:
-    """Moves a client's camera to a photo's, with a field of view in which the whole photo is visible."""
+    """Moves a client's camera to that of a photo, with a field of view that shows the whole photo."""
     pose = pose_of(view.camera)
     with client.atomic():
         client.camera.position = pose.position

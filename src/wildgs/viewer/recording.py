@@ -1,4 +1,4 @@
-"""A camera path: keyframes, and the video and camera file that are made of them."""
+"""A camera path: key frames, and a video and a camera file made from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEIGHTS = ("360", "480", "720", "1080")
 ASPECT = 16 / 9
 MIN_VIEWS, MAX_VIEWS = 2, 200
 SECONDS = (1.0, 60.0)
-"""Shortest and longest video; with the largest of `HEIGHTS` this bounds its frames and their size."""
+"""Shortest and longest video."""
 COLOR = (77, 171, 247)
 MARKER_SIZE = 0.04
 
@@ -39,8 +39,8 @@ class VideoOrder:
 
     Attributes:
         keyframes: Cameras to interpolate, at least two.
-        seconds: Its length.
-        relight: Whether the light changes from the left to the right one along the path.
+        seconds: Length of the video.
+        relight: Whether the light changes from the left to the right one during the video.
     """
 
     keyframes: tuple[Camera, ...]
@@ -49,7 +49,7 @@ class VideoOrder:
 
 
 class RecordingPanel:
-    """The controls of a camera path, and its keyframes as frustums in the scene."""
+    """The controls of a camera path, and its key frames as frustums in the scene."""
 
     def __init__(
         self,
@@ -61,23 +61,21 @@ class RecordingPanel:
 
         Args:
             server: The viewer's server.
-            folder: For videos; None while none can be made (training).
-            ordered: Called on a thread of viser, with the client that asks for the video.
+            folder: Folder for videos; None if videos are not available (during training).
+            ordered: Called on a thread of viser with the client that requests the video.
         """
         self.folder = folder
         self._server, self._ordered = server, ordered
         self._poses: list[Pose] = []
         self._markers: list[viser.CameraFrustumHandle] = []
         gui = server.gui
-        add = gui.add_button(
-            "Add this view", hint="The camera where it is now becomes the next view of the path"
-        )
+        add = gui.add_button("Add this view", hint="Add the current camera to the path")
         add.on_click(lambda event: None if event.client is None else self.add(event.client.camera))
         gui.add_button("Remove the last view").on_click(lambda _: self.drop())
         self._seconds = gui.add_slider("Seconds", *SECONDS, 0.5, 6.0)
         self._height = gui.add_dropdown("Height", HEIGHTS, initial_value="480")
         self._relight = gui.add_checkbox(
-            "Change light from left to right", False, hint="Otherwise the light stays as it is shown"
+            "Change light from left to right", False, hint="Otherwise the video keeps the current light"
         )
         self._make = gui.add_button("Make the video", disabled=folder is None)
         self._make.on_click(lambda event: self._ordered(event.client))
@@ -85,7 +83,7 @@ class RecordingPanel:
         self.tell(self._describe())
 
     def add(self, camera: Any) -> None:
-        """Adds a keyframe; a path that is full stays as it is."""
+        """Adds a key frame unless the path has `MAX_VIEWS`."""
         if len(self._poses) >= MAX_VIEWS:
             self.tell(f"A path has at most {MAX_VIEWS} views.")
             return
@@ -105,22 +103,22 @@ class RecordingPanel:
         self.tell(self._describe())
 
     def drop(self) -> None:
-        """Removes the last keyframe."""
+        """Removes the last key frame."""
         if self._poses:
             self._poses.pop()
             self._markers.pop().remove()
         self.tell(self._describe())
 
     def order(self) -> VideoOrder:
-        """The video as the controls describe it; raises `UserError` if it has too few views or is too long."""
+        """The settings of the controls; raises `UserError` if there are too few views or the video is too long."""
         if len(self._poses) < MIN_VIEWS:
             raise UserError(
-                "a path needs at least two views: add this view, fly somewhere else, and add that one"
+                "a path needs at least two views: add this view, move the camera, and add another one"
             )
         seconds = float(self._seconds.value)
         if self._height.value not in HEIGHTS or not SECONDS[0] <= seconds <= SECONDS[1]:
             raise UserError(
-                f"videos take up to {SECONDS[1]:.0f} seconds and are up to {HEIGHTS[-1]} pixels high"
+                f"videos are limited to {SECONDS[1]:.0f} seconds and a height of {HEIGHTS[-1]} pixels"
             )
         height = int(self._height.value)
         cameras = tuple(camera_of(pose, height) for pose in self._poses)
@@ -134,10 +132,10 @@ class RecordingPanel:
 
     def _describe(self) -> str:
         if self.folder is None:
-            return "Videos can be made after training: open the run with wildgs view."
+            return "Videos are available after training: open the run with wildgs view."
         count = len(self._poses)
         if count < MIN_VIEWS:
-            return f"{count} of at least two views. Fly somewhere and add the view."
+            return f"{count} of at least two views. Move the camera and add the view."
         return f"{count} views"
 
 
@@ -147,17 +145,17 @@ FPS = 30.0
 def make_film(
     subject: Subject, desk: LightDesk, order: VideoOrder, file: Path, progress: Callable[[int, int], bool]
 ) -> Path:
-    """Renders a video along the keyframes, and writes the camera file beside it (the same name, .json).
+    """Renders a video along the key frames and writes a camera file of the same name (.json).
 
     Args:
         subject: The scene.
         desk: Its light.
         order: Settings of the video.
-        file: The video.
-        progress: Called with (frames done, frames in all) after every frame; False stops.
+        file: The video file.
+        progress: Called with (frames done, number of frames) after every frame; False cancels.
 
     Raises:
-        UserError: The video cannot be written, or `progress` stopped it. No file is left then.
+        UserError: The video cannot be written or was cancelled; no file is left.
     """
     height = order.keyframes[0].height
     width = 2 * round(height * ASPECT / 2)
@@ -168,7 +166,7 @@ def make_film(
 
 
 def free_name(folder: Path) -> Path:
-    """The next name for a video in a folder."""
+    """The next unused name for a video in a folder."""
     number = 1
     while (file := folder / f"path_{number:03d}.mp4").exists():
         number += 1
@@ -189,4 +187,4 @@ def _frames(
         picture, _ = subject.render(camera, look)
         yield picture.numpy()
         if not progress(number + 1, len(cameras)):
-            raise UserError("the video was not finished: the viewer was closed")
+            raise UserError("the video is incomplete, because the viewer was closed")

@@ -1,4 +1,4 @@
-"""`wildgs.view`, and the viewer of a training: the server, its address, and the life of a page."""
+"""`wildgs.view`, and the viewer during training: starting and stopping the server, and its URLs."""
 
 from __future__ import annotations
 
@@ -38,40 +38,40 @@ def open_server(config: ServerConfig, title: str) -> GuardedServer:
     """Starts an empty viewer page with a title.
 
     Raises:
-        UserError: viser is not installed, the address is not one of this machine's, or sharing failed.
+        UserError: viser is not installed, this machine does not have the address, or sharing failed.
     """
     import_viser()
     from wildgs.viewer.guarded import GuardedServer
 
     _check_address(config)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser greets in a box of its own
+    with contextlib.redirect_stdout(io.StringIO()):  # hides viser's start message
         server = GuardedServer(config.host, config.port, share=config.share)
     if config.share:
         public = server.request_share_url(verbose=False)
         if public is None:
             server.stop()
             raise UserError(
-                "viser's relay gave no public address; leave --share out and use the local address"
+                "viser's relay did not provide a public URL; leave out --share and use the local URL"
             )
         server.access.allow_name(urlsplit(public).hostname or "")
-    # viser's own share dialog would show the public address without the token.
+    # viser's share dialog would show the public URL without the token.
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.gui.set_panel_label(printable(title))
     server.scene.set_up_direction("+z")
-    # What no Gaussian covers is black, as the rasteriser has it.
+    # A black background as in the rasteriser.
     server.scene.set_background_image(np.zeros((2, 2, 3), dtype=np.uint8), format="png")
     return server
 
 
 def address(server: GuardedServer, config: ServerConfig) -> str:
-    """The address for a browser on this machine, with the viewer's token."""
+    """The URL for a browser on this machine, including the token."""
     host = LOCAL if config.host in ("0.0.0.0", "::", "") else config.host
     local = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
     return f"{local}/{server.access.token}/"
 
 
 def public_address(server: GuardedServer, config: ServerConfig) -> str | None:
-    """The address at viser's relay, None unless the viewer is shared."""
+    """The URL at viser's relay; None unless the viewer is shared."""
     public = server.request_share_url(verbose=False) if config.share else None
     return None if public is None else f"{public.rstrip('/')}/{server.access.token}/"
 
@@ -87,29 +87,29 @@ def import_viser():
 
 
 def _check_address(config: ServerConfig) -> None:
-    """Rejects an impossible address, for which viser would try a thousand ports."""
+    """Rejects an invalid address, for which viser would try a thousand ports."""
     if not 0 <= config.port <= 65535:
-        raise UserError(f"--port {config.port}: ports are 0 to 65535, 0 for any free one")
+        raise UserError(f"--port {config.port}: must be from 0 to 65535; 0 selects a free port")
     try:
         family, kind, protocol, _, target = socket.getaddrinfo(config.host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as trial:
             trial.bind(target)
     except OSError as error:
         raise UserError(
-            f"--host {config.host}: this machine has no such address; use {LOCAL} for local access only,"
-            " 0.0.0.0 for all interfaces"
+            f"--host {config.host}: this machine does not have this address; use {LOCAL} for local access only, "
+            "0.0.0.0 for all interfaces"
         ) from error
 
 
 VIDEO_FOLDER = "videos"
 
-# pycolmap sets a SIGTERM handler of its own when it is imported, which localisation does at its first use: here it
-# comes before our handlers, and after what `wildgs.scene` has to load before it.
+# pycolmap installs a SIGTERM handler when it is imported. It is imported here, before our handlers are installed,
+# instead of at the first localisation.
 import_module("pycolmap")
 
 
 class OpenViewer:
-    """A page that is being served at `urls`; use `view` to open one."""
+    """A viewer page served at `urls`, opened by `view`."""
 
     def __init__(self, viewer: Viewer, urls: Sequence[str]) -> None:
         self.viewer, self.urls = viewer, tuple(urls)
@@ -124,7 +124,7 @@ class OpenViewer:
         """Serves until Ctrl-C, then closes the page.
 
         Raises:
-            TerminatedError: SIGTERM or SIGHUP came; the page is closed.
+            TerminatedError: SIGTERM or SIGHUP arrived; the page is closed.
         """
         self.start()
         with signals_as_interrupts():
@@ -151,22 +151,22 @@ def view(
     server: ServerConfig | None = None,
     viewer: ViewerConfig | None = None,
 ) -> OpenViewer:
-    """Opens a run in the browser: fly, change the light, stand where photos were taken, record a path.
+    """Opens a run in the browser: navigate, change the light, jump to the photos' viewpoints, record a camera path.
 
     Args:
         run: A run folder, or a loaded scene.
-        appearance: One or two lights to begin with.
-        server: Where the page is reached.
-        viewer: What is shown.
+        appearance: One or two initial appearances.
+        server: Network address.
+        viewer: Content of the page.
 
     Returns:
         The open page; `start` serves it in the background, `stay` until Ctrl-C.
 
     Raises:
-        UserError: There is no run, no viser, or no such address.
+        UserError: The run does not exist, viser is not installed, or the address is invalid.
     """
     if len(appearance) > 2:
-        raise UserError("--appearance takes one or two lights; more can be chosen in the viewer")
+        raise UserError("--appearance takes one or two lights; the viewer offers the others")
     config = server or ServerConfig()
     folder = run.run.folder if isinstance(run, LoadedScene) else Path(run)
     opened = open_server(config, folder.resolve().name)
@@ -184,26 +184,26 @@ def view(
 
 
 def addresses(server: GuardedServer, config: ServerConfig) -> list[str]:
-    """The addresses of the page: on this machine, and the public one if the page is shared."""
+    """The URLs of the page: the local one, and the public one if the page is shared."""
     found = (address(server, config), public_address(server, config))
     return [url for url in found if url is not None]
 
 
 class TrainingWindow:
-    """A page that shows a training while it runs, and its result afterwards."""
+    """A viewer page that shows training while it runs, and its result afterwards."""
 
     def __init__(self, server: ServerConfig, title: str, announce: Callable[[str], None]) -> None:
-        """Takes the page's address and title, and a function that prints where the page is."""
+        """Sets the page's network address and title; `announce` prints its URLs."""
         self._config, self._title, self._announce = server, title, announce
         self._open: OpenViewer | None = None
         self._status = ""
 
     @contextmanager
     def attach(self, trainer: Trainer, scene: Scene) -> Iterator[Observer]:
-        """Shows a training (`wildgs.train(attach=[window.attach])`); the page outlives it unless it fails.
+        """Shows a training (`wildgs.train(attach=[window.attach])`); the page stays open unless it fails.
 
         Raises:
-            UserError: There is no viser, or no such address.
+            UserError: viser is not installed, or the address is invalid.
         """
         server = open_server(self._config, self._title)
         try:
@@ -230,7 +230,7 @@ class TrainingWindow:
         self._status = f"trained {trainer.step:,} steps, {len(trainer.method.gaussians):,} Gaussians"
 
     def stay(self) -> None:
-        """Keeps showing the result, until Ctrl-C."""
+        """Shows the result until Ctrl-C."""
         if self._open is not None:
             self._open.viewer.set_status(self._status)
             self._open.viewer.ask_for_update()

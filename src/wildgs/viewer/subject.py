@@ -1,4 +1,4 @@
-"""What the viewer shows: a method with its photos, trained or in training."""
+"""The content of the viewer: a trained method with its photos, or one in training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Subject:
     """A trained method with its photos."""
 
     def __init__(self, method: Method, scene: Scene, find_look: Callable[..., Look] | None = None) -> None:
-        """Shows a method; `find_look` is as `LightSources.find`, which it is for the scene by default."""
+        """Creates the subject; `find_look` defaults to `LightSources.find`."""
         self.method = method
         self.scene = scene
         self.sh_degree = method.sh_degree
@@ -37,45 +37,45 @@ class Subject:
 
     @property
     def relightable(self) -> bool:
-        """Whether photos have a say in the method's colours."""
+        """Whether the method's colours depend on an appearance."""
         return self.method.relightable
 
     @property
     def device(self) -> torch.device:
-        """Where the method is."""
+        """The method's device."""
         return self.method.gaussians.means.device
 
     @property
     def version(self) -> int:
-        """Changes when the method changes and what was computed from it is out of date."""
+        """Changes whenever the method changes."""
         return 0
 
     def look(self, spec: str | Path, like: str | None = None) -> Look:
-        """The light of a photo by name, or of any picture file, which borrows the camera of the photo `like`.
+        """The look of a photo by name, or of an image file, for which the camera of the photo `like` is used.
 
         Raises:
-            UserError: There is no such photo or file, or it cannot be read.
+            UserError: The photo or file does not exist or cannot be read.
         """
         return self._find_look(spec if self.relightable else NEUTRAL, like=like)
 
     @torch.no_grad()
     def visibility(self, view: View) -> Float[Tensor, "H W"] | None:
-        """M of a photo (1 = static), in main memory; None for a method that predicts no mask."""
+        """The mask M of a photo (1 = static) on the CPU; None for a method that predicts no mask."""
         visibility = self.method.visibility(view.load(self.device)[0])
         return None if visibility is None else visibility.float().cpu()
 
     @torch.no_grad()
     def render(self, camera: Camera, look: Look) -> tuple[UInt8[Tensor, "H W 3"], Rendering]:
-        """A picture in main memory, and the rendering with depth and alpha from which it comes."""
+        """Renders an 8-bit image on the CPU, and the rendering with depth and alpha."""
         rendering = self.method.render(camera, look.sh, sh_degree=self.sh_degree)
         return to_8bit(rendering.colors).cpu(), rendering
 
 
 class TrainingSubject(Subject):
-    """A method in training: rendered at the present stage of its schedule, between two steps."""
+    """A method in training, rendered between two steps at the current stage of its schedule."""
 
     def __init__(self, trainer: Trainer, scene: Scene) -> None:
-        """Shows a trainer's method, which must not be in the middle of a step when this class is called."""
+        """Creates the subject; none of its methods may be called during a training step."""
         super().__init__(trainer.method, scene)
         self._trainer = trainer
         self._explicit = True
@@ -88,7 +88,7 @@ class TrainingSubject(Subject):
         return self._trainer.step
 
     def _catch_up(self) -> None:
-        """Drops looks of earlier steps, which may have had other Gaussians, and updates the stage."""
+        """Discards looks of earlier steps, when the Gaussians may have been different, and updates the stage."""
         if self._step == self._trainer.step:
             return
         self._step = self._trainer.step

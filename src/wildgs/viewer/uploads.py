@@ -1,4 +1,4 @@
-"""Uploads from browsers: bounded in size and number, and reported as done only once they are usable."""
+"""Uploads from browsers: limited in size and number, and reported as successful only if they can be used."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any, Protocol, runtime_checkable
 from wildgs.errors import UserError
 
 MAX_BYTES = 64 * 2**20
-"""Of one upload."""
+"""Largest upload."""
 MAX_OPEN = 4
-"""Unfinished uploads of all browsers together."""
+"""Largest number of unfinished uploads of all browsers."""
 MAX_PARTS = 4096
 IDLE_SECONDS = 60.0
-"""After so long without a new part, an unfinished upload makes room for another."""
+"""Time after which an unfinished upload without new parts is discarded."""
 MAX_NAME = 255
 
 
@@ -25,27 +25,27 @@ class Replies(Protocol):
     """Notifies a browser of the state of its upload."""
 
     def progress(self, connection: Hashable, upload: Upload, received: int) -> None:
-        """So many bytes were received; all of them means that the upload has succeeded."""
+        """Reports the number of bytes received; the full size means success."""
         ...
 
     def failed(self, connection: Hashable, upload: Upload, reason: str) -> None:
-        """The upload has failed."""
+        """Reports that the upload failed."""
         ...
 
 
 @dataclass(eq=False)
 class Upload:
-    """A transfer that has begun.
+    """An upload in progress.
 
     Attributes:
-        button: Id of the control it belongs to.
-        transfer: Its id, chosen by the browser.
-        name: File name, as the browser has it.
-        size: Bytes in all.
-        parts: Parts in all; they come in order.
-        content: What was received.
-        received_parts: How many parts that is.
-        last: When the last part came, in seconds of the monotonic clock.
+        button: Id of the upload control.
+        transfer: Id of the upload, chosen by the browser.
+        name: File name sent by the browser.
+        size: Total number of bytes.
+        parts: Total number of parts, which arrive in order.
+        content: Received bytes.
+        received_parts: Number of received parts.
+        last: Time of the last part, in seconds of the monotonic clock.
     """
 
     button: str
@@ -59,10 +59,10 @@ class Upload:
 
 
 class Uploads:
-    """Collects the parts of uploads, and passes finished ones to the control that they are for.
+    """Collects the parts of uploads and passes finished ones to their control's receiver.
 
-    `start`, `part` and `drop` are called on the server's own thread only; finished uploads are used one after the
-    other on a thread of their own, so that no two large pictures are decoded at once. `replies` notifies browsers.
+    `start`, `part` and `drop` are called on the server's thread only. Finished uploads are processed one at a time
+    on another thread, to limit memory. `replies` notifies browsers.
     """
 
     def __init__(self, replies: Replies) -> None:
@@ -73,11 +73,11 @@ class Uploads:
         self._finishing: set[Upload] = set()
 
     def receive(self, button: str, receiver: Callable[[str, bytes], None]) -> None:
-        """Sets the receiver of a control's uploads (name, content); it raises `UserError` for unusable ones."""
+        """Sets the receiver of a control's uploads, called with (name, content); it may raise `UserError`."""
         self._receivers[button] = receiver
 
     def start(self, connection: Hashable, message: Mapping[str, Any]) -> None:
-        """Begins an upload, or refuses it."""
+        """Starts or rejects an upload."""
         values = [message.get(name) for name in ("source_component_uuid", "transfer_uuid", "filename")]
         counts = [message.get(name) for name in ("size_bytes", "part_count")]
         button, transfer, name = values
@@ -91,10 +91,10 @@ class Uploads:
         )
         if upload.size > MAX_BYTES or upload.parts > MAX_PARTS:
             return self._replies.failed(
-                connection, upload, f"pictures may have up to {MAX_BYTES // 2**20} MB; send a smaller one"
+                connection, upload, f"images are limited to {MAX_BYTES // 2**20} MB; upload a smaller one"
             )
         if upload.size == 0 or upload.parts == 0:
-            return self._replies.failed(connection, upload, "the picture is empty")
+            return self._replies.failed(connection, upload, "the image is empty")
         self._forget_idle()
         if len(self._open) + len(self._finishing) >= MAX_OPEN:
             return self._replies.failed(connection, upload, "too many uploads at once; try again in a minute")
@@ -102,7 +102,7 @@ class Uploads:
         return None
 
     def part(self, connection: Hashable, message: Mapping[str, Any]) -> None:
-        """Takes the next part of an upload."""
+        """Receives the next part of an upload."""
         key = connection, str(message.get("transfer_uuid"))[:100]
         upload, content = self._open.get(key), message.get("content")
         if upload is None:
@@ -110,12 +110,12 @@ class Uploads:
         expected = message.get("part_index") == upload.received_parts
         if not expected or not isinstance(content, bytes) or len(content) > upload.size - len(upload.content):
             del self._open[key]
-            return self._replies.failed(connection, upload, "the upload was damaged on its way; try again")
+            return self._replies.failed(connection, upload, "the upload was corrupted; try again")
         upload.content += content
         upload.received_parts += 1
         upload.last = time.monotonic()
         if upload.received_parts < upload.parts:
-            # All bytes would mean success to the browser, and the picture has not been looked at.
+            # Less than the full size, which would mean success before the image is decoded.
             return self._replies.progress(connection, upload, min(len(upload.content), upload.size - 1))
         del self._open[key]
         self._finishing.add(upload)
@@ -123,22 +123,22 @@ class Uploads:
         return None
 
     def drop(self, connection: Hashable) -> None:
-        """Forgets the unfinished uploads of a browser that has left."""
+        """Discards the unfinished uploads of a closed connection."""
         for key in [key for key in self._open if key[0] == connection]:
             del self._open[key]
 
     def close(self) -> None:
-        """Ends the thread that uses finished uploads."""
+        """Stops the thread that processes finished uploads."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _finish(self, connection: Hashable, upload: Upload) -> None:
         try:
             if len(upload.content) != upload.size:
-                raise UserError("the upload was damaged on its way; try again")
+                raise UserError("the upload was corrupted; try again")
             self._receivers[upload.button](upload.name, bytes(upload.content))
         except UserError as error:
             self._replies.failed(connection, upload, str(error))
-        except Exception as error:  # a fault must reach the person who waits for the upload
+        except Exception as error:  # any error is reported to the browser
             self._replies.failed(connection, upload, f"the upload failed ({type(error).__name__})")
         else:
             self._replies.progress(connection, upload, upload.size)

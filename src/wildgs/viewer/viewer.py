@@ -1,7 +1,7 @@
-"""The viewer's page: panels around a server and a subject, and which thread does what.
+"""The viewer's page, which connects panels, server and subject.
 
-viser calls back on threads of its own, which only change small state and queue jobs. All work on the method is done
-by one thread: a worker's, or the trainer's between two steps.
+viser's callbacks run on its own threads; they only change small state and queue jobs. All work on the method is
+done by one thread, a worker's or the trainer's between two steps.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ if TYPE_CHECKING:
     from wildgs.viewer.guarded import GuardedServer
 
 REPAINT_SECONDS = 0.4
-"""Least time between updates of colours while the camera moves: each update sends all splats."""
+"""Smallest time between updates of colours while the camera moves; each update sends all splats."""
 REPAINT_DISTANCE = 0.01
-"""Movement of the camera, in the photos' median depth, that changes directions by about half a degree."""
+"""Camera movement, relative to the photos' median depth, that changes viewing directions by about half a degree."""
 FAR = 1000.0
 PAINTS: tuple[Paint, ...] = ("colour", "depth")
 
 
 class Viewer:
-    """One page on a subject."""
+    """The viewer's page for one subject."""
 
     def __init__(
         self,
@@ -61,12 +61,12 @@ class Viewer:
 
         Args:
             server: A server with an empty page.
-            subject: The scene that is shown.
-            config: Contents of the page.
-            lights: Up to two appearances to begin with; others are chosen from the photos.
-            status: A line about the subject.
-            videos: Folder for videos; None if none can be made (training).
-            day: Names of the photos that show a day, in order; empty where no day is known.
+            subject: The scene to show.
+            config: Content of the page.
+            lights: Up to two initial appearances; missing ones are chosen from the photos.
+            status: Status line.
+            videos: Folder for videos; None if videos are not available (during training).
+            day: Names of the photos of a day, in order; empty if the day is not known.
         """
         self.server, self.subject = server, subject
         self.jobs = Jobs()
@@ -114,7 +114,7 @@ class Viewer:
         return LightDesk(Light(first, Path(first).name), Light(second, Path(second).name))
 
     def _nearest_photo(self) -> str:
-        """The photo taken nearest to the camera: a picture of another place borrows its camera and depth."""
+        """The photo nearest to the camera, whose camera and depth are used for images of other places."""
         positions = torch.stack([view.camera.position.cpu() for view in self.subject.views])
         return self.subject.views[int((positions - self.display.eye).norm(dim=1).argmin())].name
 
@@ -165,7 +165,7 @@ class Viewer:
             self._ask("masks", self._mask_thumbnails)
 
     def ask_for_update(self) -> None:
-        """Queues an update of the Gaussians, the light and the comparison to the subject's present state."""
+        """Queues an update of the Gaussians, the light and the comparison to the subject's current state."""
         self._ask("light", self._relight)
         if self.gallery.masks:
             self._masks_asked(True)
@@ -173,10 +173,10 @@ class Viewer:
             self._ask("compare", self._compare)
 
     def set_status(self, text: str) -> None:
-        """Shows a line about the subject."""
+        """Sets the status line."""
         self._status.content = f'<div style="font-size:12px;margin:2px 12px 6px">{escape(text)}</div>'
 
-    def complain(self, message: str) -> None:
+    def show_error(self, message: str) -> None:
         """Notifies all clients of an error."""
         for client in self.server.get_clients().values():
             client.add_notification("Failed", printable(message), color="red", auto_close_seconds=15)
@@ -184,19 +184,19 @@ class Viewer:
     def _ask(self, kind: str, job: Job) -> None:
         self.jobs.put(kind, lambda: self._try(job))
 
-    # Called on the working thread.
+    # Called on the thread that does the jobs.
 
     def _try(self, job: Job) -> None:
-        """Does a job; its failure must end neither the worker nor the training."""
+        """Does a job; its failure must not stop the worker or the training."""
         try:
             job()
         except UserError as error:
-            self.complain(str(error))
+            self.show_error(str(error))
         except Exception as error:
             if self._closing.is_set():
-                return  # what it worked with is gone already
+                return  # the server and the panels may be closed already
             traceback.print_exc()
-            self.complain(f"{type(error).__name__} in the viewer; its log says where")
+            self.show_error(f"{type(error).__name__} in the viewer; see its terminal for details")
 
     def _relight(self) -> None:
         desk = self.lighting.desk
@@ -232,7 +232,7 @@ class Viewer:
         try:
             file = make_film(self.subject, self.lighting.desk, order, free_name(panel.folder), report)
         except Exception:
-            panel.tell("the video was not made")
+            panel.tell("the video failed")
             raise
         panel.tell(f"written: {file}")
         if client is not None:
