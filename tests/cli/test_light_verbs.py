@@ -105,7 +105,7 @@ def test_any_picture_lends_its_light(trained: Path, wildgs, names, tmp_path: Pat
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (30, 50, 3), dtype=np.uint8)).save(painting)
     options = ("--view", names[0], "--appearance", painting, "--like", names[2], "--output", tmp_path / "out")
     assert wildgs("render", trained, *options) == 0
-    assert f"borrowed from {names[2]}" in capsys.readouterr().out
+    assert f"uses camera and depth of {names[2]}" in capsys.readouterr().out
     assert (tmp_path / "out" / "painting" / f"{Path(names[0]).stem}.png").is_file()
 
 

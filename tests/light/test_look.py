@@ -95,5 +95,5 @@ def test_the_sky_of_another_look(method, looks, tmp_path) -> None:
 
 def test_no_sky_to_swap_is_one_line(vanilla) -> None:
     look = own_look(vanilla)
-    with pytest.raises(UserError, match="no sky apart"):
+    with pytest.raises(UserError, match="not separate the sky"):
         with_sky(look, look)

@@ -95,7 +95,7 @@ def test_auto_takes_the_training_photo_most_alike(sources, tmp_path, wall) -> No
 
 
 def test_a_picture_that_cannot_be_localised_says_so_and_is_used(sources, picture, unknown_place) -> None:
-    with pytest.warns(WildGSWarning, match=r"3 inliers.*borrowed from .*--like"):
+    with pytest.warns(WildGSWarning, match=r"3 inliers.*uses camera and depth of .*--like"):
         look = sources.find(picture)
     assert torch.isfinite(look.sh).all()
 

@@ -269,7 +269,7 @@ def test_folder_with_another_network_is_a_users_mistake(tmp_path: Path) -> None:
     save_resnet(tmp_path, [8, 16])
     with pytest.raises(UserError, match="another network"):
         load_encoder(str(tmp_path))
-    with pytest.raises(UserError, match="does not hold a ResNet-18"):
+    with pytest.raises(UserError, match="does not contain a ResNet-18"):
         load_encoder(str(tmp_path.parent))
 
 

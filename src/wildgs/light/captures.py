@@ -1,4 +1,4 @@
-"""When and where photos were taken, as their EXIF blocks say."""
+"""Capture time and place of photos from EXIF data."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Capture:
     """Time and place of a photo.
 
     Attributes:
-        local: Local time by the camera's clock, without time zone.
-        utc: Time in UTC: the GPS receiver's, or that of a clock with a known zone; None where there is neither.
-        place: Latitude and longitude, degrees; None where not known.
+        local: Local time of the camera's clock, without time zone.
+        utc: Time in UTC, by GPS or by a clock with a known time zone; None if unknown.
+        place: Latitude and longitude, degrees; None if unknown.
     """
 
     local: datetime
@@ -30,23 +30,23 @@ class Capture:
 
 
 def read_capture(file: Path) -> Capture | None:
-    """Reads the EXIF block of a photo; None where there is none that makes sense."""
+    """Reads the EXIF data of a photo; None if it is missing or invalid."""
     try:
         with open_image(file) as image:
             if image.format == "PNG" and not image.info.keys() & _PNG_BLOCKS:
-                return None  # Pillow would decode all pixels in search of a block behind them
+                return None  # Pillow would decode all pixels to search for EXIF data after them
             exif = image.getexif()
             details, gps = exif.get_ifd(IFD.Exif), exif.get_ifd(IFD.GPSInfo)
-        # `DateTime` is when the file was changed last, which says nothing about the light.
+        # Not `DateTime`, which is the time of the last change of the file.
         stamp = details.get(Base.DateTimeOriginal) or details.get(Base.DateTimeDigitized)
         local = datetime.strptime(str(stamp).strip("\0 "), _TIME)
         return Capture(local, _utc(gps) or _zoned(local, details), _place(gps))
-    except Exception:  # files of tourists hold anything
+    except Exception:  # EXIF data of photos from the internet may be malformed in any way
         return None
 
 
 def _utc(gps: dict) -> datetime | None:
-    """The GPS receiver's clock."""
+    """The time of the GPS receiver."""
     try:
         hours, minutes, seconds = (float(part) for part in gps[GPS.GPSTimeStamp])
         day = datetime.strptime(str(gps[GPS.GPSDateStamp]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
@@ -56,7 +56,7 @@ def _utc(gps: dict) -> datetime | None:
 
 
 def _zoned(local: datetime, details: dict) -> datetime | None:
-    """The camera's clock with its zone, as `+02:00`."""
+    """The time of the camera's clock, if it has a time zone such as `+02:00`."""
     zone = details.get(Base.OffsetTimeOriginal) or details.get(Base.OffsetTime)
     try:
         return datetime.fromisoformat(f"{local.isoformat()}{str(zone).strip(chr(0) + ' ')}").astimezone(UTC)

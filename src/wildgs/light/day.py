@@ -1,9 +1,9 @@
-"""A day from the lights of photos: which photo was taken at which height of the sun, and which ones show the day.
+"""Orders photos by the elevation of the sun, and selects photos that show the course of a day.
 
-The luminance of every Gaussian relative to the scene's mean does not depend on exposure. How it varies from photo
-to photo is mostly the height of the sun: lit and shaded sides, long shadows, lamps. The axis is learnt for each
-scene, from the hours of photos where they are known, otherwise from rough statistics that hold anywhere (under a
-low sun photos are warm, dark and of high contrast, and lit sides are warmer than shaded ones).
+The luminance of every Gaussian relative to the scene's mean does not depend on exposure. It varies between photos
+mostly with the elevation of the sun: lit and shaded sides, long shadows, lamps. A regression for each scene
+predicts the elevation from it, trained on capture times if known, otherwise on rough statistics that hold for any
+scene (with a low sun, photos are warm, dark and of high contrast, and lit sides are warmer than shaded ones).
 """
 
 from __future__ import annotations
@@ -21,37 +21,38 @@ from wildgs.light.sun import NOON
 from wildgs.model.method import Method
 
 GAUSSIANS = 4096
-"""Gaussians whose colours describe a light: those that are largest in the pictures."""
+"""Number of Gaussians whose colours describe a light: those that are largest in the images."""
 
 KEYS = 9
-"""Photos between which the light of a day changes, at most."""
+"""Upper bound on the number of key photos of a day."""
 
 LEAST_PHOTOS = 5
 
 _ROUGH = (4, 0.1)
 _TIMED = (8, 0.005)
-"""Principal components, and ridge: times teach the axis on them; rough statistics teach it on the patterns as they
-are, with a ridge that is a share of their variance, and only the side of the sun is sought among the components."""
+"""Number of principal components, and ridge of the regression. Times are regressed on the components. Rough
+statistics are regressed on the unwhitened patterns, with a ridge relative to their variance; the components then
+only serve to find the side from which the sun shines."""
 
 _PHOTOS_PER_COMPONENT = 4
 _LEAST_TIMED = 8
-"""Photos with a time from which on the order is theirs, if their light agrees."""
+"""Smallest number of photos with a capture time for ordering by time."""
 
 _LEAST_AGREEMENT = 0.4
-"""Correlation between the height of the sun by time and by light below which times say nothing about this scene."""
+"""Smallest correlation between the sun's elevation by time and by light for ordering by time."""
 
 _DEVIATIONS, _LEAST_ERROR = 3.0, 30.0
-"""A time is wrong if its light differs by so many robust deviations, and at least so many degrees of the sun."""
+"""A capture time is rejected if its error exceeds both this number of robust standard deviations and of degrees."""
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """What a light does to a scene.
+    """Description of a light.
 
     Attributes:
-        luminance: Logarithm of the linear luminance of some Gaussians, less its mean.
+        luminance: Log luminance of some Gaussians minus its mean.
         warmth: Logarithm of red over blue of the same Gaussians.
-        level: The mean that was taken off.
+        level: The mean of the log luminance.
     """
 
     luminance: Float[np.ndarray, " M"]
@@ -64,11 +65,11 @@ class Day:
     """Photos in the order of a day.
 
     Attributes:
-        phases: Height of the sun of each photo that is part of the order, in degrees: of a rising sun as it is, of
-            a setting one subtracted from 180. Ascending. Without times the scale is arbitrary.
-        keys: Photos that show the day, in order.
-        by_time: Whether the order follows the times of photos, not their light alone.
-        left_out: Photos whose time does not fit their light, by name, with the reason.
+        phases: Elevation of the sun for each photo in degrees, before noon; 180 minus the elevation after noon.
+            Ascending. Without capture times the scale is arbitrary.
+        keys: Key photos of the day, in order.
+        by_time: Whether photos are ordered by capture time instead of by light.
+        left_out: Photos whose capture time contradicts their light, with the reason.
     """
 
     phases: dict[str, float]
@@ -79,7 +80,7 @@ class Day:
 
 @torch.no_grad()
 def visible_rows(method: Method, centres: Float[Tensor, "V 3"]) -> Tensor:
-    """Indices of the Gaussians, sky apart, that are largest in pictures from these camera centres."""
+    """Indices of the Gaussians, without the sky, that are largest in images from these camera centres."""
     gaussians = method.gaussians
     distance = torch.cdist(gaussians.means, centres.to(gaussians.means)).median(dim=1).values.clamp_min(1e-6)
     longest = gaussians.scales.sort(dim=1, descending=True).values
@@ -91,7 +92,7 @@ def visible_rows(method: Method, centres: Float[Tensor, "V 3"]) -> Tensor:
 
 
 def pattern_of(sh: Float[Tensor, "N K 3"], rows: Tensor) -> Pattern:
-    """The pattern of a light, of the Gaussians at some rows."""
+    """The pattern of a light on the Gaussians with these indices."""
     shown = (0.5 + C0 * sh[rows, 0]).clamp(0.01, 1.2).double().cpu().numpy()
     linear = shown**2.2
     luminance = np.log(linear @ np.array([0.2126, 0.7152, 0.0722]))
@@ -100,11 +101,11 @@ def pattern_of(sh: Float[Tensor, "N K 3"], rows: Tensor) -> Pattern:
 
 
 def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day | None:
-    """Orders photos by the height of the sun and chooses those that show the day.
+    """Orders photos by the elevation of the sun and selects key photos.
 
     Args:
-        patterns: Of each photo's light, by name.
-        times: Phases of the day (`wildgs.light.sun.phase_of`) of the photos whose time is known.
+        patterns: Patterns of the photos' lights, by name.
+        times: Phases of the day (`wildgs.light.sun.phase_of`) of photos with a capture time.
 
     Returns:
         None if there are fewer than `LEAST_PHOTOS` photos.
@@ -117,10 +118,10 @@ def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day
     if len(timed) >= _LEAST_TIMED:
         phases = np.array([times[names[index]] for index in timed])
         axes = _components(luminance, _TIMED[0])
-        kept, agreement = _believable(axes[timed], NOON - np.abs(phases - NOON))
+        kept, agreement = _consistent_times(axes[timed], NOON - np.abs(phases - NOON))
         if agreement >= _LEAST_AGREEMENT:
             left = {
-                names[index]: "its light does not fit its time"
+                names[index]: "its capture time contradicts its light"
                 for index, keep in zip(timed, kept, strict=True)
                 if not keep
             }
@@ -128,8 +129,8 @@ def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day
             return _day(names, axes, np.array(chosen), phases[kept], left, by_time=True)
     axes = _components(luminance, _ROUGH[0])
     height = _learn(_by_variance(luminance), _rough_height(list(patterns.values())), _ROUGH[1])
-    # Light alone does not tell a rising sun from a setting one: the side from which it comes does, but not which is
-    # which. The side is taken to be what varies most besides the height.
+    # The side of the sun, morning or evening, is taken to be the largest variation besides the elevation. Which of
+    # the two is the morning cannot be determined from light alone.
     side = axes - np.outer(height, axes.T @ height / (height @ height))
     rising = np.linalg.svd(side, full_matrices=False)[0][:, 0] < 0
     rank = (height.argsort().argsort() + 0.5) / len(names) * 180 - 90
@@ -146,21 +147,21 @@ def _components(luminance: Float[np.ndarray, "P M"], count: int) -> Float[np.nda
 
 
 def _by_variance(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P _"]:
-    """All principal components of the patterns, as they vary, of variance 1 together."""
+    """All principal components of the patterns, unwhitened, with a total variance of 1."""
     left, spread, _ = np.linalg.svd(luminance - luminance.mean(axis=0), full_matrices=False)
     return left * spread * np.sqrt(len(luminance)) / max(np.linalg.norm(spread), 1e-12)
 
 
 def _rough_height(patterns: Sequence[Pattern]) -> Float[np.ndarray, " P"]:
-    """A guess at the order of the heights of the sun, between -0.5 and 0.5."""
+    """An estimate of the ranks of the sun's elevations, scaled to -0.5 to 0.5."""
     luminance = np.stack([pattern.luminance for pattern in patterns])
     warmth = np.stack([pattern.warmth for pattern in patterns])
     warmth -= warmth.mean(axis=0)
     varied = luminance - luminance.mean(axis=0)
     contrast = varied.std(axis=1)
-    together = ((warmth - warmth.mean(axis=1, keepdims=True)) * varied).mean(axis=1)
+    covariance = ((warmth - warmth.mean(axis=1, keepdims=True)) * varied).mean(axis=1)
     level = np.array([pattern.level for pattern in patterns])
-    score = _scaled(level) - _scaled(warmth.mean(axis=1)) - _scaled(contrast) - _scaled(together)
+    score = _scaled(level) - _scaled(warmth.mean(axis=1)) - _scaled(contrast) - _scaled(covariance)
     return score.argsort().argsort() / len(score) - 0.5
 
 
@@ -175,33 +176,35 @@ def _learn(
     ridge: float,
     weights: np.ndarray | None = None,
 ) -> Float[np.ndarray, " P"]:
-    """Ridge regression of a target on the components; its values for all photos."""
+    """Predictions for all photos by ridge regression of a target on the components."""
     weights = np.ones(len(axes)) if weights is None else weights
     middle = (weights @ target) / weights.sum()
     gram = (axes * weights[:, None]).T @ axes / weights.sum() + ridge * np.eye(axes.shape[1])
     return middle + axes @ np.linalg.solve(gram, axes.T @ (weights * (target - middle)) / weights.sum())
 
 
-def _believable(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, " P"]) -> tuple[np.ndarray, float]:
-    """Which heights fit the light, and the correlation between the two for those."""
+def _consistent_times(
+    axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, " P"]
+) -> tuple[np.ndarray, float]:
+    """Mask of the elevations that are consistent with the light, and their cross-validated correlation with it."""
     weights = np.ones(len(axes))
     error = np.zeros(len(axes))
-    for _ in range(20):  # least absolute deviations: wrong times have no say in the end
+    for _ in range(20):  # least absolute deviations, robust against wrong times
         error = np.abs(heights - _learn(axes, heights, _TIMED[1], weights))
         weights = 1 / np.maximum(error, 2.0)
     usual = 1.4826 * np.median(error)
     kept = error <= max(_DEVIATIONS * usual, _LEAST_ERROR)
-    return kept, _foretold(axes[kept], heights[kept])
+    return kept, _cross_validated(axes[kept], heights[kept])
 
 
-def _foretold(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, " P"]) -> float:
-    """Correlation between heights and what the other photos' heights foretell of each (leave one out)."""
+def _cross_validated(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, " P"]) -> float:
+    """Correlation between elevations and their leave-one-out predictions."""
     own = np.einsum("pc,cd,pd->p", axes, np.linalg.inv(axes.T @ axes + 1e-9 * np.eye(axes.shape[1])), axes)
     error = (heights - _learn(axes, heights, _TIMED[1])) / np.maximum(1 - own - 1 / len(axes), 0.05)
-    foretold = heights - error
-    if min(np.std(foretold), np.std(heights)) < 1e-9:
+    predicted = heights - error
+    if min(np.std(predicted), np.std(heights)) < 1e-9:
         return 0.0
-    return float(np.corrcoef(foretold, heights)[0, 1])
+    return float(np.corrcoef(predicted, heights)[0, 1])
 
 
 def _day(
@@ -225,7 +228,7 @@ def _day(
 
 
 def _smooth_keys(axes: Float[np.ndarray, "Q C"], phases: Float[np.ndarray, " Q"]) -> list[int]:
-    """One photo for each part of the day: the one whose light is most like that of its neighbours in time."""
+    """One photo for each part of the day, whose light is most similar to the average of its neighbours in time."""
     spacing = max(np.ptp(phases), 1e-6) / KEYS
     near = np.exp(-0.5 * ((phases[:, None] - phases[None]) / spacing) ** 2)
     local = near @ axes / near.sum(axis=1, keepdims=True)

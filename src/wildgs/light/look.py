@@ -1,4 +1,4 @@
-"""A look: the scene under one appearance, shaded once; mixes of looks, and looks that change over time."""
+"""Looks: the scene under one appearance, mixes of looks, and looks that change over time."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from wildgs.model.appearance import Appearance, Embeddings
 from wildgs.model.method import Method
 
 NEUTRAL = "neutral"
-"""The name of the mean light."""
+"""Name of the mean appearance."""
 
 SUM_TOLERANCE = 1e-3
-"""How far from one the weights of a mix may add up: rounded weights on a command line are no mistake."""
+"""Largest deviation of the sum of weights from 1, to allow for rounding on the command line."""
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The appearance of a whole scene, from a photo, a picture, a file or a mix of those.
+    """An appearance of the scene, from a photo, an image, a file or a mix of several.
 
     Attributes:
-        name: For people and for file names.
-        embeddings: What `mix` mixes.
+        name: Name for display and file names.
+        embeddings: Embeddings of the Gaussians.
         method: The trained method to which the embeddings belong.
-        note: How the light was found, where that is worth a line to the user.
-        sky: The look from which the sky's colours are taken; None takes this one's.
+        note: How the appearance was obtained, if the user should know.
+        sky: The look whose colours the sky has; None for this one.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Look:
 
     @cached_property
     def sh(self) -> Float[Tensor, "N K 3"]:
-        """Spherical harmonics of all Gaussians under this light, on the method's device; shaded once, then kept."""
+        """Spherical harmonics of all Gaussians under this appearance, on the method's device; cached."""
         with torch.no_grad():
             own = self.method.fuse(self.embeddings)
             which = None if self.sky is None else self.method.sky()
@@ -53,24 +53,24 @@ class Look:
 
 @torch.no_grad()
 def look_of(method: Method, appearance: Appearance, name: str, note: str = "") -> Look:
-    """The look of an encoded photo."""
+    """The look for an appearance."""
     return Look(name, method.embed(appearance), method, note)
 
 
 def own_look(method: Method) -> Look:
-    """The one look of a method that is not relightable."""
+    """The only look of a method that is not relightable."""
     return look_of(method, Appearance(), "own light")
 
 
 def with_sky(look: Look, sky: Look) -> Look:
-    """A look with the sky of another; depth and alpha do not depend on either.
+    """A look with the sky of another one.
 
     Raises:
-        UserError: The looks are of different scenes, or the method does not tell the sky from the scene.
+        UserError: The looks are of different scenes, or the method does not separate the sky.
     """
     _require_one_scene([look, sky])
     if look.method.sky() is None:
-        raise UserError(f"this run of {look.method.label} has no sky apart from the scene; leave --sky out")
+        raise UserError(f"this run of {look.method.label} does not separate the sky; leave --sky out")
     name = f"{look.name} under the sky of {sky.name}"
     return Look(name, look.embeddings, look.method, look.note, sky.sky or sky)
 
@@ -82,17 +82,17 @@ def mix(
     local_weights: Sequence[float | int] | None = None,
     name: str | None = None,
 ) -> Look:
-    """Tuning: a look between others (paper, appendix Video Demo), at the cost of one shading, no encoding.
+    """Mixes looks (appearance tuning in the paper's appendix Video Demo).
 
     Args:
         looks: Any number of looks of one scene.
-        weights: One for each, adding up to one. Negative ones extrapolate.
-        local_weights: For the local embeddings (shadows, lamps, what lies where), where they shall be mixed in
-            other parts than the global one (colour and brightness of it all).
-        name: Of the new look; None describes the mix.
+        weights: One weight for each look, with sum 1. Negative weights extrapolate.
+        local_weights: Weights of the local embeddings (shadows, lamps), if they differ from those of the global
+            embedding (global colour and brightness).
+        name: Name of the new look; None describes the mix.
 
     Raises:
-        UserError: The weights do not fit the looks or do not add up to one, or the looks are of different scenes.
+        UserError: The weights are invalid, or the looks are of different scenes.
     """
     if not looks:
         raise UserError("a mix needs at least one appearance")
@@ -116,12 +116,12 @@ def _require_one_scene(looks: Sequence[Look]) -> None:
 
 
 def _checked(looks: Sequence[Look], weights: Sequence[float | int]) -> list[float]:
-    """The weights as they were given, but for rounding: scaled to add up to one exactly."""
+    """The weights scaled to an exact sum of 1; raises `UserError` if they are invalid."""
     if len(weights) != len(looks):
         raise UserError(f"{len(looks)} appearances need {len(looks)} weights, not {len(weights)}")
     total = float(sum(weights))
     if not abs(total - 1) <= SUM_TOLERANCE:
-        raise UserError(f"the weights of a mix must add up to 1, these add up to {total:g}")
+        raise UserError(f"the weights of a mix must add up to 1, not to {total:g}")
     return [float(weight) / total for weight in weights]
 
 
@@ -138,34 +138,30 @@ def _describe(looks: Sequence[Look], weights: Sequence[float | int], local: Sequ
 
 @dataclass(frozen=True)
 class Timeline:
-    """Looks one after the other over time; between two of them their mix.
+    """A sequence of looks over time with interpolation between them.
 
     Attributes:
-        looks: At least one; a single one does not change.
-        pace: Shares of the time, ascending from 0 to 1, at which even parts of the way are done; empty for an even
-            pace.
+        looks: At least one look.
+        pace: Times, ascending from 0 to 1, at which equal parts of the sequence are done; empty for a uniform pace.
     """
 
     looks: tuple[Look, ...]
     pace: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what shows nothing."""
+        """Checks that there is a look."""
         if not self.looks:
             raise UserError("a video needs at least one appearance")
 
     @classmethod
     def of(cls, looks: Look | Sequence[Look] | Timeline) -> Timeline:
-        """One look, or several over time."""
+        """Creates a timeline from one look or several."""
         if isinstance(looks, Timeline):
             return looks
         return cls((looks,) if isinstance(looks, Look) else tuple(looks))
 
     def at(self, share: float) -> Look:
-        """The look at a share of the time, from 0 to 1.
-
-        At the looks themselves no mixing and no new shading takes place.
-        """
+        """The look at a time from 0 to 1; looks of the sequence are returned without mixing."""
         share = min(max(share, 0.0), 1.0)
         if self.pace:
             share = float(np.interp(share, self.pace, np.linspace(0, 1, len(self.pace))))
@@ -179,10 +175,10 @@ class Timeline:
         return mix([self.looks[index], self.looks[index + 1]], [1 - amount, amount])
 
     def paced(self, changes: Sequence[float]) -> Timeline:
-        """The same looks, at a pace at which a change is spread evenly over time.
+        """The same looks at a pace at which a measured change is uniform over time.
 
         Args:
-            changes: How much changes in each of some even parts of this timeline, not negative.
+            changes: Change in each of some equal parts of this timeline, not negative.
         """
         done = np.concatenate([[0.0], np.cumsum(changes)])
         return replace(self, pace=tuple((done / done[-1]).tolist()) if done[-1] > 0 else ())

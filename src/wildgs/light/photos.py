@@ -1,4 +1,4 @@
-"""Appearances of photos with a camera, of pictures that borrow one, and of all training photos together."""
+"""Appearances of photos of the scene, of other images, and the mean appearance of all training photos."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wildgs.scene.scene import to_unit
 
 @torch.no_grad()
 def encode_view(method: Method, view: View) -> Appearance:
-    """The appearance of one of the scene's own photos."""
+    """The appearance of a photo of the scene."""
     device = method.gaussians.means.device
     photo, keep = view.load(device)
     return method.encode(photo, view.camera.to(device), keep, name=view.name)
@@ -28,17 +28,17 @@ def encode_view(method: Method, view: View) -> Appearance:
 
 @torch.no_grad()
 def encode_photo(method: Method, photo: UInt8[Tensor, "H W 3"], camera: Camera) -> Appearance:
-    """The appearance of a photo of the place, seen by a camera in the scene's aligned frame."""
+    """The appearance of a new photo of the scene with its camera in the aligned frame."""
     device = method.gaussians.means.device
     return method.encode(to_unit(photo, device), camera.to(device))
 
 
 @torch.no_grad()
 def encode_picture(method: Method, picture: UInt8[Tensor, "h w 3"], camera: Camera) -> Appearance:
-    """The appearance of any picture, as if the camera had seen it: style transfer (paper, appendix).
+    """The appearance of any image, as if it were a photo by the camera: style transfer (paper, appendix).
 
-    The picture is cut to the camera's shape about its middle. All of it is lifted: what a mask, learnt from photos
-    of the place, takes for a passer-by in a painting means nothing.
+    The image is cropped to the camera's aspect ratio. The mask is not used, since it is not valid for images of
+    other scenes.
     """
     device = method.gaussians.means.device
     fitted = cover(picture, camera.width, camera.height)
@@ -46,7 +46,7 @@ def encode_picture(method: Method, picture: UInt8[Tensor, "h w 3"], camera: Came
 
 
 def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "H W 3"]:
-    """The picture scaled and cut about its middle so that it fills a frame; nothing is stretched."""
+    """Scales an image and crops it about its centre to fill a frame, without distortion."""
     image = Image.fromarray(picture.numpy())
     scale = max(width / image.width, height / image.height)
     part = (width / scale, height / scale)
@@ -57,17 +57,17 @@ def cover(picture: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Ten
 
 
 MAX_PHOTOS = 200
-"""Most photos that are encoded; of larger collections as many, evenly spread over the names."""
+"""Upper bound on the number of encoded photos, an even selection of larger collections."""
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """The light of the training photos.
+    """The appearances of the training photos.
 
     Attributes:
         views: The photos.
-        global_embeddings: Emb^g of each.
-        mean: Mean of all embeddings and colour maps over the photos: the neutral light.
+        global_embeddings: Emb^g of each photo.
+        mean: Mean of all embeddings and colour maps: the neutral appearance.
     """
 
     views: tuple[View, ...]
@@ -82,7 +82,7 @@ class Atlas:
 
 @torch.no_grad()
 def make_atlas(method: Method, views: Sequence[View], progress: Counter | None = None) -> Atlas:
-    """Encodes the training photos (at least one), `MAX_PHOTOS` at most."""
+    """Encodes the training photos (at least one, at most `MAX_PHOTOS`)."""
     count = min(len(views), MAX_PHOTOS)
     chosen = tuple(views[index * len(views) // count] for index in range(count))
     global_embeddings: list[Tensor] = []

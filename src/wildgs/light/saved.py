@@ -1,4 +1,4 @@
-"""Appearance files: a look of one run, small and without code in it (safetensors)."""
+"""Appearance files: looks of one run as small safetensors files."""
 
 from __future__ import annotations
 
@@ -20,23 +20,22 @@ from wildgs.model.method import Method
 SUFFIX = ".safetensors"
 FORMAT = "wildgs-appearance-2"
 SKY = "sky."
-"""Prefix of the tensors of the look whose sky is shown."""
+"""Prefix of the tensors of the sky's look."""
 
 
 def save_look(look: Look, file: Path) -> Path:
-    """Writes a look so that `load_look` brings it back for the same checkpoint.
+    """Writes a look, which `load_look` restores for the same checkpoint.
 
-    The global embedding is kept as it is, the local ones in half precision, and only those that differ from the
-    one that most Gaussians share (outside the triplane's box all are alike).
+    Local embeddings are stored in half precision, and only those that differ from the most frequent one (they are
+    all the same outside the triplane's box).
 
     Raises:
-        UserError: The look is of a run that has one light only, the name does not end as it must, or the disk is
-            full or read-only.
+        UserError: The run cannot be relit, the extension is wrong, or the file cannot be written.
     """
     if not look.method.relightable:
         raise UserError(f"{look.method.label} cannot be relit; there is no appearance to save")
     if file.suffix != SUFFIX:
-        raise UserError(f"{file}: appearance files end in {SUFFIX}")
+        raise UserError(f"{file}: the name of an appearance file must end in {SUFFIX}")
     tensors = _packed(look.embeddings)
     if look.sky is not None:
         tensors |= {f"{SKY}{name}": values for name, values in _packed(look.sky.embeddings).items()}
@@ -47,13 +46,15 @@ def save_look(look: Look, file: Path) -> Path:
 
 
 def load_look(method: Method, file: Path) -> Look:
-    """Reads an appearance file for the checkpoint that it was made with.
+    """Reads an appearance file of the same checkpoint.
 
     Raises:
-        UserError: The file is missing or no appearance file, or belongs to another run or step.
+        UserError: The file is missing, is not an appearance file, or belongs to another run or step.
     """
     if not file.is_file():
-        raise UserError(f"{file}: no such file; `wildgs appearance RUN PHOTO --output {file.name}` makes one")
+        raise UserError(
+            f"{file}: no such file; `wildgs appearance RUN PHOTO --output {file.name}` creates it"
+        )
     try:
         with safe_open(file, framework="pt") as opened:
             header = json.loads((opened.metadata() or {})["wildgs"])
@@ -63,7 +64,7 @@ def load_look(method: Method, file: Path) -> Look:
         name, owner = str(header["name"]), header["run"]
         if not method.relightable or owner != method.fingerprint():
             raise UserError(
-                f"{file}: was made with another run, or another step of this one; create it again with "
+                f"{file}: belongs to another run, or to another step of this run; create it again by "
                 "`wildgs appearance`"
             )
         of_sky = {key.removeprefix(SKY): values for key, values in tensors.items() if key.startswith(SKY)}
@@ -74,7 +75,7 @@ def load_look(method: Method, file: Path) -> Look:
 
 
 def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
-    """Embeddings as the file's tensors."""
+    """Converts embeddings to the file's tensors."""
     tensors = {"global_embedding": embeddings.global_embedding.detach().cpu().float().contiguous()}
     if embeddings.color_map is not None:
         tensors["color_map"] = embeddings.color_map.detach().cpu().contiguous()
@@ -93,13 +94,13 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
 
 
 def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
-    """A file's embeddings for a method's Gaussians; raises `KeyError` or `ValueError` if they do not fit."""
+    """Converts the file's tensors to embeddings; `KeyError` or `ValueError` if they do not fit the method."""
     device = method.gaussians.means.device
     common, color_map = tensors["global_embedding"], tensors.get("color_map")
     if common.shape != (method.global_size,):
         raise ValueError("embeddings of another length")
     if color_map is not None and color_map.shape == (3, 4) and not color_map.any():
-        color_map = None  # as earlier versions wrote it
+        color_map = None  # written by earlier versions
     if color_map is not None and color_map.shape != (3, method.map_columns):
         raise ValueError("a colour map of another shape")
     weights = tensors.get("basis_weights")

@@ -1,4 +1,4 @@
-"""Appearances by what a user writes: a photo of the scene, a new photo, any picture, the mean, or a file."""
+"""Finds the appearance a user names: a photo of the scene, a new photo, any image, neutral, or a saved file."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from wildgs.sfm.feature_index import FeatureIndex, load_feature_index
 from wildgs.sfm.localization import LocalizationError, localize
 
 AUTO = "auto"
-"""As `like`: the training photo whose global embedding is nearest."""
+"""Value of `like`: the training photo with the nearest global embedding."""
 
 KEPT_LOOKS = 16
 KEPT_BYTES = 2_000_000_000
-"""Bounds on the number and memory of the last used looks, which are cached with their harmonics."""
+"""Bounds on number and memory of cached looks."""
 
 
 class LightSources:
-    """Finds the looks of one scene, and caches the last few."""
+    """Finds the looks of one scene and caches the last few."""
 
     def __init__(
         self, method: Method, open_scene: Callable[[], Scene], index_cache: Path | None = None
     ) -> None:
-        """Finds looks of a trained method.
+        """Creates the sources of a trained method.
 
         Args:
             method: The trained method.
-            open_scene: Reads the scene when it is first needed: a saved appearance needs none.
-            index_cache: File that caches the feature index in which new photos are localised.
+            open_scene: Reads the scene, when it is first needed.
+            index_cache: File that caches the feature index for localising new photos.
         """
         self.method = method
         self._open_scene = open_scene
@@ -63,20 +63,21 @@ class LightSources:
         return own_look(self.method)
 
     def find(self, spec: str | Path, *, like: str | None = None, progress: Progress | None = None) -> Look:
-        """The look that a user asks for.
+        """Finds a look.
 
-        In this order: `neutral`; a saved appearance (`*.safetensors`); a photo of the scene by its name, with or
-        without its ending; a file. A file is taken for a photo of the place and localised; where that fails (a
-        warning says how far it got), and where `like` is given, it is a picture of any kind and borrows a camera.
+        The spec is tried in this order: `neutral`; a saved appearance (`*.safetensors`); the name of a photo of the
+        scene, with or without extension; an image file. An image file is localised as a new photo of the scene. If
+        that fails, with a warning, or if `like` is given, it is used with the camera and depth of a photo of the
+        scene.
 
         Args:
             spec: One of the above.
-            like: The photo of the scene whose camera and depth a file borrows, or `auto` for the training photo
-                that looks most like it. None tries to localise first.
+            like: The photo of the scene whose camera and depth are used for an image file, or `auto` for the most
+                similar training photo. None tries to localise it first.
             progress: Called during long work.
 
         Raises:
-            UserError: There is no such photo or file, or it cannot be read.
+            UserError: The photo or file does not exist or cannot be read.
         """
         if not self.method.relightable:
             if spec != NEUTRAL:
@@ -116,16 +117,16 @@ class LightSources:
         look = self._borrow(file, like or AUTO, progress)
         if failure:
             warnings.warn(
-                f"{failure}; taken for a picture of another place: {look.note} (--like chooses another)",
+                f"{failure}; treated as an image of another place: {look.note} (change it by --like)",
                 WildGSWarning,
                 stacklevel=4,
             )
         return look
 
     def _locate(self, file: Path, progress: Progress) -> Look:
-        """The look of a new photo of the place."""
+        """The look of a new photo of the scene."""
         if self._index is None:
-            show = counter(progress, "finding features of the scene's photos")
+            show = counter(progress, "extracting features of the scene's photos")
             self._index = load_feature_index(self.scene, self._index_cache, show)
         long_side = int(median(max(view.camera.width, view.camera.height) for view in self.scene.views))
         found = localize(file, self._index, long_side)
@@ -133,11 +134,11 @@ class LightSources:
         return look_of(self.method, appearance, file.name, found.describe())
 
     def _borrow(self, file: Path, like: str, progress: Progress) -> Look:
-        """The look of any picture, through the camera of a photo of the scene."""
+        """The look of any image with camera and depth of a photo of the scene."""
         picture = read_picture(file)
         lender = find_view(self.scene, like) if like != AUTO else self._most_alike(picture, progress)
         appearance = encode_picture(self.method, picture, lender.camera)
-        return look_of(self.method, appearance, file.name, f"camera and depth borrowed from {lender.name}")
+        return look_of(self.method, appearance, file.name, f"uses camera and depth of {lender.name}")
 
     def _most_alike(self, picture: UInt8[Tensor, "H W 3"], progress: Progress) -> View:
         atlas = self.atlas(progress)
@@ -145,7 +146,7 @@ class LightSources:
         return atlas.most_alike(self.method.embed(appearance).global_embedding)
 
     def atlas(self, progress: Progress | None = None) -> Atlas:
-        """The light of all training photos; made once."""
+        """The appearances of all training photos; cached."""
         if self._atlas is None:
             show = counter(progress, "encoding the photos")
             self._atlas = make_atlas(self.method, self.scene.train_views, show)
@@ -153,19 +154,19 @@ class LightSources:
 
 
 def read_picture(file: Path) -> UInt8[Tensor, "H W 3"]:
-    """A picture file, upright.
+    """Reads an image file, rotated upright by its EXIF orientation.
 
     Raises:
-        UserError: It cannot be read.
+        UserError: The file cannot be read.
     """
     try:
         return torch.from_numpy(read_photo(file).pixels)
     except UnreadableImageError as error:
-        raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
+        raise UserError(f"{file}: {error}; give a readable image") from error
 
 
 def _stamp(file: Path) -> tuple[int, ...]:
-    """Changes when a file is rewritten; empty if there is no file."""
+    """A key that changes when a file is rewritten; empty if there is no file."""
     if not is_file(file):
         return ()
     state = file.stat()

@@ -1,4 +1,4 @@
-"""Where the sun stands, to about half a degree, by the general solar position equations of NOAA."""
+"""Position of the sun, accurate to about half a degree, by NOAA's general solar position equations."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from datetime import UTC, datetime
 from wildgs.light.captures import Capture
 
 NOON = 90.0
-"""Phase of the day at which the sun is highest."""
+"""Phase of the day at noon."""
 
 
 def sun_position(utc: datetime, latitude: float, longitude: float) -> tuple[float, float]:
-    """Elevation of the sun and its hour angle (0 at noon, negative before), all in degrees."""
+    """Elevation and hour angle of the sun (0 at noon, negative before) in degrees."""
     utc = utc.astimezone(UTC)
     hours = utc.hour + utc.minute / 60 + utc.second / 3600
     year = 2 * math.pi / 365.25 * (utc.timetuple().tm_yday - 1 + (hours - 12) / 24)
@@ -41,13 +41,14 @@ def sun_position(utc: datetime, latitude: float, longitude: float) -> tuple[floa
 
 
 def phase_of(capture: Capture, place: tuple[float, float] | None = None) -> float:
-    """Phase of the day: the sun's elevation before noon, 180 minus it afterwards; degrees.
+    """Phase of the day: the sun's elevation before noon, 180 minus the elevation afterwards; degrees.
 
-    Where the time is not known in UTC, or no place, it follows the camera's clock: 0 at 6 o'clock, 90 at 12.
+    If the UTC time or the place is unknown, the phase is computed from the camera's clock: 0 at 6 o'clock, 90 at
+    12.
 
     Args:
         capture: Time and place of a photo.
-        place: Latitude and longitude where the photo has none.
+        place: Latitude and longitude for photos without a place.
     """
     place = capture.place or place
     if capture.utc is None or place is None:

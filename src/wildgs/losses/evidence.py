@@ -1,7 +1,7 @@
-"""What speaks for something standing in the way, pixel by pixel: the gradient of the visibility mask.
+"""Evidence that pixels show transient objects, which replaces the gradient of the visibility mask.
 
-Two things must come together: a colour that the scene does not have there, and a structure that it does not have.
-Another light changes colours, by day and by dusk also their hue; it leaves edges and patterns where they are.
+Evidence requires a difference in colour and a difference in structure from the render. Different lighting changes
+brightness and hue but not edges and patterns.
 """
 
 from __future__ import annotations
@@ -12,41 +12,40 @@ from torch import Tensor
 from torch.nn import functional
 
 COLOR_CELLS = 60
-"""Colours are compared in so many cells along the long side: paving and bricks that the scene has not learnt yet,
-or that are a pixel off, average out; people do not."""
+"""Cells along the longer side in which mean colours are compared. Fine texture that is not learnt yet or is off by
+a pixel averages out, people do not."""
 BRIGHTNESS_SHARE = 0.25
-"""Of a difference in brightness against one in colour, squared: light and shadow change the one, people also the
-other."""
+"""Weight of a squared difference in brightness relative to one in chroma, since light and shadow change
+brightness."""
 HALF_EVIDENCE = 0.11
-"""Difference of colours at which evidence reaches half of its limit."""
+"""Colour difference at which the evidence is half of its maximum."""
 MOST_EVIDENCE = 0.8
-"""Limit of the evidence, in units of the image loss: twice λ^M's start, so that what is surely in the way is hidden
+"""Maximum of the evidence, in units of the image loss: twice the initial λ^M, so that certain transients are hidden
 at once."""
 STRUCTURE_SIDE = 240
-"""Structure is compared at about this many pixels along the long side, or at the photo's size if it is smaller."""
+"""Approximate longer side, in pixels, to which larger photos are reduced for comparing structure."""
 STRUCTURE_WINDOWS = 24
-"""Windows along the long side in which structure is compared."""
+"""Number of windows along the longer side in which structure is compared."""
 SAME_STRUCTURE = 0.7
-"""Correlation from which on photo and render show the same thing, whatever their colours."""
+"""Correlation from which photo and render are taken to show the same object, whatever their colours."""
 FLAT = 0.005
-"""Standard deviation of grey values below which a window counts as flat, about that of the rounding to 8 bits."""
+"""Standard deviation of grey values of a flat window, about that of rounding to 8 bits."""
 
 PROOF_CELLS = 60
-"""A triangulated point that the photo observes speaks for the cell in which it lies, of so many along the long
-side."""
+"""Cells along the longer side. A cell in which the photo observes a triangulated point is taken to be static."""
 PROOF = 0.4
-"""Weight of the proof that a cell is static, in units of the image loss: λ^M's start."""
+"""Weight of the evidence that such a cell is static, in units of the image loss: the initial λ^M."""
 
 
 @torch.no_grad()
 def transient_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """How much a pixel looks as if something stood in the way, from 0 to `MOST_EVIDENCE`.
+    """Evidence that a pixel is transient, from 0 to `MOST_EVIDENCE`.
 
-    The product of `color_evidence` and of the doubt that photo and render show the same structure, which falls
-    linearly from 1 for a structural correlation of 0 or less to 0 for `SAME_STRUCTURE`.
+    The product of `color_evidence` and structural dissimilarity, which decreases linearly from 1 at a structural
+    correlation of 0 or less to 0 at `SAME_STRUCTURE`.
 
     Args:
-        photo: I, in 0..1.
+        photo: I, RGB in [0, 1].
         render: Î.
     """
     doubt = (1 - structural_correlation(photo, render) / SAME_STRUCTURE).clamp(0, 1)
@@ -55,19 +54,19 @@ def transient_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W
 
 @torch.no_grad()
 def color_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-    """How much a pixel's colour speaks for something in the way, from 0 to `MOST_EVIDENCE`.
+    """Evidence from a pixel's colour that it is transient, from 0 to `MOST_EVIDENCE`.
 
-    The difference x of mean colours in cells, brightness counting less than hue, beyond the photo's median: while
-    all of a photo is still wrong, nothing is transient, and the mask cannot settle on hiding everything. Then
-    ``x⁴ / (x⁴ + s⁴)``: what is clearly wrong is wrong alike, what is a little off is not, and one edge does not
-    outweigh a person.
+    Let x be the difference of mean colours in cells, with a lower weight on brightness, minus its median over the
+    photo. The median prevents the mask from hiding everything while the whole render is still poor. The evidence is
+    proportional to ``x⁴ / (x⁴ + s⁴)``, a soft threshold that ignores small differences and saturates for large
+    ones.
 
     Args:
-        photo: I, in 0..1.
+        photo: I, RGB in [0, 1].
         render: Î.
 
     Returns:
-        Interpolated from cells to pixels.
+        The evidence, interpolated from cells to pixels.
     """
     height, width = photo.shape[:2]
     side = max(1, round(max(height, width) / COLOR_CELLS))
@@ -87,12 +86,12 @@ def structural_correlation(
 ) -> Float[Tensor, "H W"]:
     """Correlation of grey values in a window around every pixel, from -1 to 1.
 
-    Where both windows vary it is their normalised cross-correlation, which a light that varies slowly leaves at 1.
-    Both are taken to share noise of the standard deviation `FLAT`: two flat windows are alike (1), a flat one and
-    one with structure are not (about 0).
+    This is the normalised cross-correlation, which is invariant to smooth changes of lighting. Both windows are
+    assumed to share noise of standard deviation `FLAT`, so that two flat windows have correlation 1, and a flat and
+    a structured one about 0.
 
     Args:
-        photo: I, in 0..1.
+        photo: I, RGB in [0, 1].
         render: Î.
     """
     height, width = photo.shape[:2]
@@ -112,12 +111,12 @@ def structural_correlation(
 
 
 def _box_mean(x: Float[Tensor, "B 1 H W"], radius: int) -> Float[Tensor, "B 1 H W"]:
-    """Means over squares of ``2 radius + 1`` pixels around every pixel, cut off at the borders."""
+    """Means over squares of ``2 radius + 1`` pixels around every pixel, cropped at the borders."""
     return _line_mean(_line_mean(x, radius).mT, radius).mT
 
 
 def _line_mean(x: Float[Tensor, "*batch W"], radius: int) -> Float[Tensor, "*batch W"]:
-    """Means over ``2 radius + 1`` entries of a row around every one, from sums up to each."""
+    """Means over ``2 radius + 1`` entries of a row around every entry, by cumulative sums."""
     width = x.shape[-1]
     sums = functional.pad(x.cumsum(dim=-1), (1, 0))
     place = torch.arange(width, device=x.device)
@@ -127,12 +126,12 @@ def _line_mean(x: Float[Tensor, "*batch W"], radius: int) -> Float[Tensor, "*bat
 
 @torch.no_grad()
 def proven_static(observations: Float[Tensor, "K 2"], height: int, width: int) -> Bool[Tensor, "H W"]:
-    """Pixels in cells in which the photo observes a triangulated point: other photos show the same thing there.
+    """Pixels in cells in which the photo observes a triangulated point, and which are therefore static.
 
     Args:
         observations: Pixels (x, y) of the points.
-        height: Of the photo.
-        width: Of the photo.
+        height: Height of the photo.
+        width: Width of the photo.
     """
     side = max(1, round(max(height, width) / PROOF_CELLS))
     rows, columns = -(-height // side), -(-width // side)

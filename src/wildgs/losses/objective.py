@@ -1,4 +1,4 @@
-"""The paper's total loss, with its mask and depth terms."""
+"""The total loss with its image, mask and depth terms."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Losses:
 
     Attributes:
         image: L^I.
-        mask: L^M; 0 where there is no mask to learn.
-        depth: L^D and the error against metric depth; 0 where there is no estimate.
-        total: ``L^I + λ^M L^M + λ^D L^D`` and the weighted error against metric depth, to be differentiated.
+        mask: L^M; 0 without a mask.
+        depth: L^D plus the error against metric depth; 0 without depth maps.
+        total: ``L^I + λ^M L^M + λ^D L^D`` plus the weighted error against metric depth.
     """
 
     NAMES: ClassVar[tuple[str, ...]] = ("image", "mask", "depth", "total")
@@ -33,15 +33,15 @@ class Losses:
     total: Float[Tensor, ""]
 
     def terms(self) -> dict[str, Float[Tensor, ""]]:
-        """The four by name, without the autograd graph."""
+        """The four terms by name, detached."""
         return {name: getattr(self, name).detach() for name in self.NAMES}
 
     def detached(self) -> Losses:
-        """The same values without the autograd graph."""
+        """All terms, detached."""
         return Losses(**self.terms())
 
     def as_floats(self) -> dict[str, float]:
-        """The four numbers for a log."""
+        """The four terms as floats."""
         terms = self.terms()
         return dict(zip(terms, torch.stack([*terms.values()]).tolist(), strict=True))
 
@@ -66,20 +66,18 @@ def total_loss(
 
     Args:
         config: Weights.
-        progress: Share of the training done, 0..1, for λ^M.
-        photo: I in 0..1.
+        progress: Fraction of the training done, 0 to 1, for λ^M.
+        photo: I, RGB in [0, 1].
         render: Î.
-        visibility: M as predicted; None for a method without a mask (all visible, no mask loss).
-        keep: The user's own mask, False = ignore. Ignored pixels count in no term.
-        depth: Rendered expected depth; the depth loss needs it and `disparity`.
-        alpha: Accumulated alpha of the render; pixels below `min_alpha` are left out of the depth loss.
-        disparity: Monocular estimate, 0 where there is none; None leaves the depth loss out.
-        metric_depth: Depth in world units, 0 where there is none: where it is known, it takes the place of the
-            monocular estimate.
-        observations: Pixels (x, y) at which the photo shows triangulated points: the mask learns that these are
-            static.
-        train_mask: False passes no gradient to the mask (the pause after an opacity reset).
-        mask_threshold: Th: the depth loss leaves out pixels whose M is not above it.
+        visibility: Predicted mask M; None for a method without a mask.
+        keep: The user's mask: False = ignore the pixel in all terms.
+        depth: Rendered expected depth.
+        alpha: Accumulated alpha of the render; the depth loss ignores pixels below `min_alpha`.
+        disparity: Monocular estimate, 0 where missing; None for a photo without it.
+        metric_depth: Depth in world units, 0 where missing; used instead of the monocular estimate where it exists.
+        observations: Pixels (x, y) at which the photo observes triangulated points, which are static.
+        train_mask: Whether the mask gets a gradient (False in the pause after an opacity reset).
+        mask_threshold: Threshold Th of static pixels for the depth loss.
 
     Returns:
         All terms.
@@ -112,7 +110,7 @@ def total_loss(
 def _image_loss(
     config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None, proven: Tensor | None
 ) -> Tensor:
-    """L^I; its gradient to the mask is the formula's or the evidence, as configured."""
+    """L^I, with the configured gradient to the mask."""
     if mask is None or config.mask_gradient == "evidence":
         return masked_photometric(photo, render, mask, config.weight_l1, proven=proven)
     mask = mask[..., None]
@@ -120,7 +118,7 @@ def _image_loss(
 
 
 def _kept(visibility: Tensor | None, keep: Tensor | None, photo: Tensor) -> Tensor | None:
-    """The mask of the image loss: the predicted one, zero where the user's mask ignores."""
+    """The mask of the image loss: the predicted mask, zero where the user's mask is False."""
     if keep is None:
         return visibility
     return keep.to(photo.dtype) if visibility is None else visibility * keep
@@ -139,25 +137,25 @@ def visibility_regularizer(visibility: Float[Tensor, "H W"]) -> Float[Tensor, ""
 
 
 OUTLYING = 0.1
-"""Share of the depth beyond which an error says more about the estimate than about the render."""
+"""Relative error at which the robust loss reaches half of its maximum, as the estimate is probably an outlier."""
 
 
 def metric_error(
-    depth: Float[Tensor, "H W"], known: Float[Tensor, "H W"], selection: Bool[Tensor, "H W"]
+    depth: Float[Tensor, "H W"], estimate: Float[Tensor, "H W"], selection: Bool[Tensor, "H W"]
 ) -> Float[Tensor, ""]:
-    """Mean of ``e / (1 + e / OUTLYING)``, ``e = |known / depth - 1|`` being the relative error of inverse depth.
+    """Mean of ``e / (1 + e / OUTLYING)`` with the relative error of inverse depth ``e = |estimate / depth - 1|``.
 
     Args:
         depth: Rendered expected depth, world units along the camera's z axis.
-        known: Estimate in the same units; 0 where there is none.
-        selection: Pixels that count. Passes no gradient.
+        estimate: Estimated depth in the same units; 0 where missing.
+        selection: Pixels to compare; gets no gradient.
 
     Returns:
-        0 (equal) to `OUTLYING`; 0 where no pixel counts. The mean is over all pixels of the picture, so that photos
-        of which little is known weigh little.
+        0 (equal) to `OUTLYING`; 0 without pixels. The mean is over all pixels of the image, so that photos with few
+        estimates have a low weight.
     """
-    chosen = selection & (known > 0) & (depth.detach() > 0)
-    error = (known / torch.where(chosen, depth, 1.0) - 1).abs()
+    chosen = selection & (estimate > 0) & (depth.detach() > 0)
+    error = (estimate / torch.where(chosen, depth, 1.0) - 1).abs()
     return torch.where(chosen, error / (1 + error / OUTLYING), 0.0).mean()
 
 
@@ -171,20 +169,20 @@ def depth_correlation(
     selection: Bool[Tensor, "H W"],
     min_pixels: int = MIN_PIXELS,
 ) -> Float[Tensor, ""]:
-    """``1 + ρ(depth, disparity)`` over the selected pixels, ρ being Pearson's correlation (the paper's L^D).
+    """``1 + ρ(depth, disparity)`` over the selected pixels with Pearson's correlation ρ (the paper's L^D).
 
-    A monocular network gives disparity (large = near), so right geometry has ρ near -1. Pixels without an
-    estimate (disparity 0) are left out. Where fewer than `min_pixels` remain or one of the maps is constant,
-    ρ has no meaning: the loss is 0 and has no gradient.
+    Monocular networks predict disparity (large = near), so that ρ is close to -1 for correct geometry. Pixels
+    without an estimate (disparity 0) are ignored. If fewer than `min_pixels` remain or one of the maps is constant,
+    the loss is 0 and has no gradient.
 
     Args:
         depth: Rendered expected depth, world units along the camera's z axis.
-        disparity: Estimate in arbitrary scale and shift; 0 where there is none.
-        selection: Pixels that count: static (``M > Th``) and covered by the render. Passes no gradient.
-        min_pixels: Fewest pixels that make a correlation.
+        disparity: Estimate of arbitrary scale and shift; 0 where missing.
+        selection: Pixels to compare: static (``M > Th``) and covered by the render. Gets no gradient.
+        min_pixels: Smallest number of pixels for a correlation.
 
     Returns:
-        0 (same order and linear) to 2 (inverted).
+        0 (perfect anticorrelation) to 2 (perfect correlation).
     """
     chosen = selection & (disparity > 0)
     count = chosen.sum()
@@ -196,14 +194,14 @@ def depth_correlation(
         & (depth_variance > _MIN_RELATIVE_VARIANCE * depth_power)
         & (estimate_variance > _MIN_RELATIVE_VARIANCE * estimate_power)
     )
-    # Replaced before the root and the division: their gradients at 0 would be NaN even where unused.
+    # Replaced before root and division, whose gradients at 0 would be NaN even if unused.
     variances = torch.where(meaningful, depth_variance * estimate_variance, 1.0)
     correlation = (depth_offset * estimate_offset).sum() / divisor / variances.sqrt()
     return torch.where(meaningful, 1 + correlation, 0.0)
 
 
 def _centred(values: Tensor, chosen: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Offsets from the mean at chosen pixels (0 elsewhere), their variance and the squares' mean."""
+    """Deviations from the mean at chosen pixels (0 elsewhere), their variance, and the mean square."""
     values = torch.where(chosen, values, 0.0)
     values = values / values.detach().abs().amax().clamp(min=torch.finfo(values.dtype).tiny)
     mean = values.sum() / count

@@ -20,20 +20,19 @@ def masked_photometric(
 ) -> Float[Tensor, ""]:
     """``λ |I⊙M - Î⊙M| + (1 - λ) (1 - SSIM(I⊙M, Î⊙M))``, paper section 'Transient Objects Handling'.
 
-    The paper prints ``+SSIM`` where it means the dissimilarity; ``1 - SSIM`` (not halved) is 3DGS's, and the
-    mean runs over all pixels, hidden ones included, as the paper's formula does.
+    The paper prints ``+SSIM``, but means the dissimilarity ``1 - SSIM`` (not halved), as in 3DGS. The mean is over
+    all pixels including hidden ones, as in the paper.
 
-    The value is the formula's, and so is the gradient to the render. The gradient to the mask is not: through
-    SSIM of two pictures that share a factor M, a mask lowers the loss by being textured itself, and learns the
-    scene's edges instead of passers-by. Here hiding a pixel is worth its `transient_evidence`; showing it is worth
-    `PROOF` where it is static by proof.
+    Value and gradient to the render are those of the formula. The gradient to the mask is not: since both images
+    are multiplied by M before SSIM, a textured mask lowers the loss, so that it would learn the scene's edges
+    instead of passers-by. Instead, the gradient is `transient_evidence`, or `-PROOF` for pixels known to be static.
 
     Args:
-        photo: The reference photo I, in 0..1.
-        render: The rendered picture Î.
-        visibility: M, 1 where the photo shows the static scene; None stands for 1 everywhere.
+        photo: The photo I, RGB in [0, 1].
+        render: The render Î.
+        visibility: M, 1 where the photo shows the static scene; None = 1 everywhere.
         weight_l1: λ.
-        proven: Pixels that are static by proof (`proven_static`); None for none.
+        proven: Pixels known to be static (`proven_static`); None for none.
 
     Returns:
         The loss.
@@ -43,7 +42,7 @@ def masked_photometric(
     fixed = visibility.detach()
     loss = _photometric(photo * fixed[..., None], render * fixed[..., None], weight_l1)
     if visibility.requires_grad:
-        # Adds nothing to the value, and the evidence to the mask's gradient.
+        # Adds zero to the value and the evidence to the mask's gradient.
         evidence = transient_evidence(photo, render.detach())
         if proven is not None:
             evidence = torch.where(proven, -PROOF, evidence)

@@ -1,4 +1,4 @@
-"""Structural similarity that can be trained on: Numba on the CPU, Triton or convolutions on CUDA."""
+"""Differentiable structural similarity: Numba on the CPU, Triton or convolutions on CUDA."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ C1, C2 = 0.01**2, 0.03**2
 
 @cache
 def gaussian_taps(dtype: torch.dtype, device: torch.device | str = "cpu") -> Float[Tensor, "11"]:
-    """The one-dimensional window of 11 taps, sigma 1.5, that sums to 1."""
+    """The 1D Gaussian window of 11 taps with sigma 1.5 and sum 1."""
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float64)
     taps = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     return (taps / taps.sum()).to(device=device, dtype=dtype)
 
 
 def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> Float[Tensor, ""]:
-    """Mean structural similarity (Wang et al. 2004) with 3DGS's conventions, differentiable in both pictures.
+    """Mean structural similarity (Wang et al. 2004) with 3DGS's conventions, differentiable in both images.
 
-    The window is an 11 x 11 Gaussian of sigma 1.5, pictures are padded with zeros, and moments are the
-    window's plain weighted means (no sample correction).
+    The window is an 11 x 11 Gaussian of sigma 1.5, images are padded with zeros, and moments are weighted means
+    without sample correction.
 
     Args:
-        x: A picture with data range 1.
-        y: The other picture.
+        x: An image with data range 1.
+        y: The other image.
 
     Returns:
-        The mean over pixels and channels; 1 for equal pictures.
+        The mean over pixels and channels; 1 for equal images.
     """
     if x.device.type == "cpu":
         return _CpuSSIM.apply(x, y)
@@ -103,7 +103,7 @@ def _matrix(picture: Tensor) -> Any:
 
 
 class _ConvolutionSSIM(torch.autograd.Function):
-    """Value and gradient by convolutions in full float32, for devices without a kernel of their own."""
+    """Value and gradient by convolutions in float32, for devices without a kernel."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, y: Tensor) -> Tensor:
@@ -114,17 +114,17 @@ class _ConvolutionSSIM(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         x, y, derivatives = ctx.saved_tensors
-        # The window is symmetric, so the adjoint of filtering with zero padding is the same filtering.
+        # The window is symmetric, so the filter with zero padding is self-adjoint.
         by_x, by_y, by_square, by_cross = _filter(derivatives * (grads[0] / x.numel())).permute(0, 2, 3, 1)
         return by_x + 2 * by_square * x + by_cross * y, by_y + 2 * by_square * y + by_cross * x
 
 
 def ssim_map(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
-    """Structural similarity of every pixel, same conventions as `ssim`, by two separable convolutions.
+    """Structural similarity of every pixel, with the conventions of `ssim`.
 
     Args:
-        x: A picture with data range 1.
-        y: The other picture.
+        x: An image with data range 1.
+        y: The other image.
     """
     return _similarity(x.permute(2, 0, 1), y.permute(2, 0, 1))[0].permute(1, 2, 0)
 
@@ -132,7 +132,7 @@ def ssim_map(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> Float[Tens
 def _similarity(
     x: Float[Tensor, "C H W"], y: Float[Tensor, "C H W"]
 ) -> tuple[Float[Tensor, "C H W"], Float[Tensor, "4 C H W"]]:
-    """The similarity and its derivatives by E[x], E[y], E[x^2] (the same as by E[y^2]) and E[xy]."""
+    """The similarity and its derivatives with respect to E[x], E[y], E[x^2] (equal to E[y^2]) and E[xy]."""
     mean_x, mean_y, square_x, square_y, cross = _filter(torch.stack([x, y, x * x, y * y, x * y]))
     product, squares = mean_x * mean_y, mean_x**2 + mean_y**2
     a, b = 2 * product + C1, 2 * (cross - product) + C2
@@ -148,7 +148,7 @@ def _similarity(
 def _filter(maps: Float[Tensor, "M C H W"]) -> Float[Tensor, "M C H W"]:
     """Weighted means over the window.
 
-    Never in TF32: with ten bits of mantissa E[x^2] - E[x]^2 cancels (an SSIM of 0.932 became 0.901).
+    TF32 is disabled, because with ten bits of mantissa E[x^2] - E[x]^2 cancels (an SSIM of 0.932 became 0.901).
     """
     taps = gaussian_taps(maps.dtype, maps.device)
     with _full_precision():
@@ -158,7 +158,7 @@ def _filter(maps: Float[Tensor, "M C H W"]) -> Float[Tensor, "M C H W"]:
 
 @contextmanager
 def _full_precision() -> Iterator[None]:
-    """Convolutions without TF32; where torch has the newer setting for it, it refuses to read the older one."""
+    """Disables TF32 for convolutions, by torch's newer setting if there is one (the older one then fails)."""
     cudnn: Any = torch.backends.cudnn
     place, name, value = (
         (cudnn.conv, "fp32_precision", "ieee") if hasattr(cudnn, "conv") else (cudnn, "allow_tf32", False)

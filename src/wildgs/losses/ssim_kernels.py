@@ -1,8 +1,8 @@
 """Numba kernels of the structural similarity and its gradient.
 
-A picture is a matrix of H rows and L = W * C numbers (channels interleaved), so that one inner loop runs over
-all channels of a row and the horizontal window steps by C. Threads draw blocks of `BLOCK` rows, and a row's
-results go to that row alone, so results do not depend on how many threads there are.
+An image is a matrix of H rows and L = W * C numbers (channels interleaved), so that one inner loop runs over all
+channels of a row and the horizontal window steps by C. Threads take blocks of `BLOCK` rows and write results per
+row, so that results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from wildgs.threads import fetch_add
 
 RADIUS = 5
 BLOCK = 16
-_MATHS = {"reassoc", "contract", "arcp", "nsz"}  # not nnan: a NaN must stay visible
+_MATHS = {"reassoc", "contract", "arcp", "nsz"}  # without nnan, so that NaN propagates
 
 
 @njit(fastmath=_MATHS, error_model="numpy")
 def _filter_row(padded, taps, channels, out):
-    """Filter one row that has RADIUS * channels zeros on either side.
+    """Filters one row that has RADIUS * channels zeros on either side.
 
-    The views keep every index a plain loop variable, without which LLVM does not vectorise the loop.
+    With views, every index is the plain loop variable, which LLVM needs to vectorise the loop.
     """
     length = out.shape[0]
     a0, a1 = padded[0:length], padded[10 * channels : 10 * channels + length]
@@ -40,8 +40,8 @@ def _filter_row(padded, taps, channels, out):
 def _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_sums):
     """Rows of `ssim_forward`.
 
-    With E the window's weighted mean, `derivatives` [4, H, L] takes those of ssim by E[x], E[y], E[x^2] (the
-    same as by E[y^2]) and E[xy].
+    With E the window's weighted mean, the derivatives of ssim with respect to E[x], E[y], E[x^2] (equal to E[y^2])
+    and E[xy] are written to `derivatives` [4, H, L].
     """
     height, length = x.shape
     pad = RADIUS * channels
@@ -87,7 +87,7 @@ def _forward_rows(first, last, x, y, taps, c1, c2, channels, derivatives, row_su
 def _backward_rows(first, last, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
     """Rows of `ssim_backward`.
 
-    The window is symmetric, so the adjoint of filtering with zero padding is the same filtering.
+    The window is symmetric, so the filter with zero padding is self-adjoint.
     """
     height, length = x.shape
     pad = RADIUS * channels
@@ -116,7 +116,7 @@ def _backward_rows(first, last, x, y, taps, scale, channels, derivatives, grad_x
 
 @njit(nogil=True, error_model="numpy")
 def ssim_forward(counter, x, y, taps, c1, c2, channels, derivatives, row_sums):
-    """Sum the SSIM map per row and keep its derivatives by the window's moments."""
+    """Sums the SSIM map per row and stores its derivatives with respect to the window's moments."""
     while True:
         first = fetch_add(counter, 1) * BLOCK
         if first >= len(x):
@@ -127,7 +127,7 @@ def ssim_forward(counter, x, y, taps, c1, c2, channels, derivatives, row_sums):
 
 @njit(nogil=True, error_model="numpy")
 def ssim_backward(counter, x, y, taps, scale, channels, derivatives, grad_x, grad_y):
-    """Gradients of scale * (sum of the SSIM map) by both pictures, from what `ssim_forward` kept."""
+    """Gradients of scale * (sum of the SSIM map) with respect to both images, from the stored derivatives."""
     while True:
         first = fetch_add(counter, 1) * BLOCK
         if first >= len(x):
@@ -137,5 +137,5 @@ def ssim_backward(counter, x, y, taps, scale, channels, derivatives, grad_x, gra
 
 
 def blocks(height: int) -> int:
-    """How many blocks of rows there are to draw."""
+    """Number of blocks of rows."""
     return -(-height // BLOCK)

@@ -1,6 +1,6 @@
-"""Triton kernels of the structural similarity and its gradient: a vertical and a horizontal pass each way.
+"""Triton kernels of the structural similarity and its gradient, each as a vertical and a horizontal pass.
 
-A picture is a matrix of H rows and L = W * C numbers (channels interleaved), as in `ssim_kernels`: the vertical
+An image is a matrix of H rows and L = W * C numbers (channels interleaved), as in `ssim_kernels`: the vertical
 window steps by L, the horizontal one by C. All arithmetic is in float32.
 """
 
@@ -23,7 +23,7 @@ _C1, _C2 = tl.constexpr(0.01**2), tl.constexpr(0.03**2)
 
 @triton.jit
 def _vertical_moments(x, y, taps, out, count, length, BLOCK: tl.constexpr):
-    """E[x], E[y], E[x^2], E[y^2] and E[xy] over the window's column; `out` is [5, H, L]."""
+    """E[x], E[y], E[x^2], E[y^2] and E[xy] over columns of the window; `out` is [5, H, L]."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     sum_x = tl.zeros([BLOCK], tl.float32)
     sum_y = tl.zeros([BLOCK], tl.float32)
@@ -51,7 +51,7 @@ def _vertical_moments(x, y, taps, out, count, length, BLOCK: tl.constexpr):
 
 @triton.jit
 def _similarity(moments, taps, derivatives, sums, count, length, channels, BLOCK: tl.constexpr):
-    """The sum of the similarity over a block, and its derivatives by E[x], E[y], E[x^2] and E[xy], [4, H, L]."""
+    """Sum of the similarity over a block, and derivatives [4, H, L] with respect to E[x], E[y], E[x^2], E[xy]."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     column = place % length
     mean_x = tl.zeros([BLOCK], tl.float32)
@@ -89,7 +89,7 @@ def _similarity(moments, taps, derivatives, sums, count, length, channels, BLOCK
 
 @triton.jit
 def _vertical_adjoint(derivatives, taps, scale, out, count, length, BLOCK: tl.constexpr):
-    """The four derivatives, times a scale, filtered along columns."""
+    """Filters the four derivatives, times a scale, along columns."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     factor = tl.load(scale)
     for part in tl.static_range(4):
@@ -103,7 +103,7 @@ def _vertical_adjoint(derivatives, taps, scale, out, count, length, BLOCK: tl.co
 
 @triton.jit
 def _horizontal_adjoint(columns, taps, x, y, grad_x, grad_y, count, length, channels, BLOCK: tl.constexpr):
-    """Gradients by both pictures from what `_vertical_adjoint` left."""
+    """Gradients with respect to both images, from the result of `_vertical_adjoint`."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     column = place % length
     by_x = tl.zeros([BLOCK], tl.float32)
@@ -127,11 +127,11 @@ def _horizontal_adjoint(columns, taps, x, y, grad_x, grad_y, count, length, chan
 
 
 class TritonSSIM(torch.autograd.Function):
-    """Mean structural similarity of two float32 pictures [H, W, C]; see `wildgs.losses.ssim.ssim`."""
+    """Mean structural similarity of two float32 images [H, W, C]; see `wildgs.losses.ssim.ssim`."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, y: Tensor) -> Tensor:
-        """The mean over pixels and channels; the host does not wait."""
+        """The mean over pixels and channels, without synchronisation."""
         from wildgs.losses.ssim import gaussian_taps
 
         x, y = x.contiguous(), y.contiguous()
@@ -148,7 +148,7 @@ class TritonSSIM(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients by both pictures."""
+        """Gradients with respect to both images."""
         from wildgs.losses.ssim import gaussian_taps
 
         x, y, derivatives = ctx.saved_tensors

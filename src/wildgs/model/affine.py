@@ -1,11 +1,11 @@
 """Per-photo embeddings and affine colours, in the manner of WildGaussians (Kulhanek et al. 2024).
 
-Every training photo has a learnt embedding, and so has every Gaussian. A small network reads both, and the
-Gaussian's flat colour, and gives a scale and an offset for the Gaussian's colours, as WildGaussians do; gsplat's
-appearance option is alike, with an offset alone. A photo that did not train gets the embedding under which the
-scene, as it is, looks most like it: a few steps of gradient descent, as in NeRF-W and WildGaussians.
+Every training photo and every Gaussian has a learnt embedding. A small MLP maps both and the Gaussian's base colour
+to a scale and an offset of the Gaussian's colours, as in WildGaussians; gsplat's appearance option is similar but
+predicts an offset only. The embedding of a new photo is optimised by a few steps of gradient descent with the scene
+fixed, as in NeRF-W and WildGaussians.
 
-Neither masks nor depth are part of this method.
+The method uses neither masks nor depth.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from wildgs.model.training_pass import ParameterGroup, Stage, TrainingOutput
 from wildgs.rasterize import blend
 
 FOURIER_ENTRIES = 6
-"""Entries of a Gaussian's embedding for each frequency: sine and cosine along three axes."""
+"""Entries of a Gaussian's embedding per frequency: sine and cosine along three axes."""
 OUTPUT_SCALE = 0.1
-"""Factor on the output layer's initial weights: training begins at the base colours."""
+"""Factor on the output layer's initial weights, so that training starts near the base colours."""
 
 
 @dataclass(frozen=True)
 class AffineRates:
-    """Learning rates of what plain 3DGS does not have.
+    """Learning rates of harmonics, embeddings and the MLP.
 
     Attributes:
-        sh0: Flat colour.
-        shN: Higher harmonics.
-        gaussians: Embeddings of the Gaussians.
-        photos: Embeddings of the photos, at the start.
-        network: The network, at the start.
-        decay: Factor that `photos` and `network` reach at the end, exponentially.
+        sh0: Learning rate of SH degree 0.
+        shN: Learning rate of higher SH degrees.
+        gaussians: Learning rate of the Gaussians' embeddings.
+        photos: Initial learning rate of the photos' embeddings.
+        network: Initial learning rate of the MLP.
+        decay: Ratio of the final to the initial learning rate of `photos` and `network`; the decay is exponential.
     """
 
     sh0: float = 2.5e-3
@@ -66,12 +66,12 @@ class AffineConfig:
     Attributes:
         photo_size: Length of a photo's embedding.
         gaussian_size: Length of a Gaussian's embedding; a multiple of 6.
-        hidden: Width of the network's two hidden layers.
-        sh_degree: Degree of the base colours' harmonics.
-        encode_steps: Steps of Adam that fit the embedding of a photo that did not train.
-        encode_rate: Their learning rate at the start; it falls to zero along a cosine.
-        initial: First Gaussians beside those on SfM points.
-        learning_rates: Of networks, embeddings and harmonics.
+        hidden: Width of the MLP's two hidden layers.
+        sh_degree: Degree of the spherical harmonics of the base colours.
+        encode_steps: Adam steps that fit the embedding of a new photo.
+        encode_rate: Initial learning rate of these steps, with cosine decay to zero.
+        initial: Initial Gaussians in addition to those on SfM points.
+        learning_rates: Learning rates of harmonics, embeddings and the MLP.
     """
 
     photo_size: int = 32
@@ -84,7 +84,7 @@ class AffineConfig:
     learning_rates: AffineRates = field(default_factory=AffineRates)
 
     def __post_init__(self) -> None:
-        """Refuses sizes that no network can have."""
+        """Validates the sizes."""
         if self.gaussian_size < FOURIER_ENTRIES or self.gaussian_size % FOURIER_ENTRIES:
             raise UserError(f"gaussian_size {self.gaussian_size}: must be a multiple of {FOURIER_ENTRIES}")
         if min(self.photo_size, self.hidden) < 1 or self.encode_steps < 0:
@@ -94,7 +94,7 @@ class AffineConfig:
 
 
 class AffineGS(Method):
-    """Gaussians whose base colours are scaled and shifted by what a photo's embedding asks for."""
+    """Gaussians whose base colours are scaled and shifted depending on a photo's embedding."""
 
     name: ClassVar[str] = "affine"
     label: ClassVar[str] = "Affine colours"
@@ -104,7 +104,13 @@ class AffineGS(Method):
     photo_keys: Int[Tensor, " P"]
 
     def __init__(self, config: AffineConfig, gaussians: Gaussians, photo_keys: Int[Tensor, " P"]) -> None:
-        """Takes Gaussians with rows sh0, shN and embedding, and the keys of the training photos (see `_key`)."""
+        """Creates the method.
+
+        Args:
+            config: Configuration.
+            gaussians: Gaussians with the rows sh0, shN and embedding.
+            photo_keys: Keys of the training photos (`_key`).
+        """
         super().__init__()
         self.config = config
         self.gaussians = gaussians
@@ -123,18 +129,18 @@ class AffineGS(Method):
 
     @classmethod
     def rows(cls, config: AffineConfig) -> dict[str, tuple[int, ...]]:
-        """Geometry, harmonics, and the Gaussians' embeddings."""
+        """Geometry, harmonics and the Gaussians' embeddings."""
         harmonics = {"sh0": (1, 3), "shN": ((config.sh_degree + 1) ** 2 - 1, 3)}
         return GEOMETRY_ROWS | harmonics | {"embedding": (config.gaussian_size,)}
 
     @classmethod
     def initial(cls, config: AffineConfig) -> InitialConfig:
-        """As configured; by default the same as Wild-GS."""
+        """The configured initial Gaussians, by default those of Wild-GS."""
         return config.initial
 
     @classmethod
     def create(cls, config: AffineConfig, initial: InitialGaussians) -> AffineGS:
-        """Starts from the points' colours, with Fourier features of the positions as the Gaussians' embeddings."""
+        """Initialises base colours from the points and embeddings from Fourier features of the positions."""
         low, high = initial.points.quantile(0.02, dim=0), initial.points.quantile(0.98, dim=0)
         places = (initial.rows["means"] - low) / (high - low).clamp_min(1e-6)
         frequencies = 2.0 ** torch.arange(config.gaussian_size // FOURIER_ENTRIES)
@@ -149,11 +155,11 @@ class AffineGS(Method):
 
     @classmethod
     def blank(cls, config: AffineConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> AffineGS:
-        """For as many photos as the checkpoint has."""
+        """Creates an untrained method for the checkpoint's number of photos."""
         return cls(config, gaussians, torch.zeros_like(state["photo_keys"]))
 
     def row_rates(self) -> dict[str, LearningRate]:
-        """Those of harmonics and embeddings."""
+        """Learning rates of harmonics and embeddings."""
         rates = self.config.learning_rates
         return {
             "sh0": LearningRate(rates.sh0),
@@ -162,7 +168,7 @@ class AffineGS(Method):
         }
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """The photos' embeddings, and the network."""
+        """The photos' embeddings, and the MLP."""
         rates = self.config.learning_rates
         layers = (self.from_photo, self.from_gaussian, self.hidden, self.output)
         network = [parameter for layer in layers for parameter in layer.parameters()]
@@ -181,15 +187,15 @@ class AffineGS(Method):
         trust_mask: bool = True,
         explicit: bool = True,
     ) -> Appearance:
-        """The learnt embedding of a training photo; for any other photo, the one fitted to its pixels."""
+        """The learnt embedding of a training photo; an optimised one for any other photo."""
         learnt = self._learnt(name)
         return Appearance(self._fit(photo, camera, keep) if learnt is None else learnt)
 
     def _learnt(self, name: str | None) -> Float[Tensor, " G"] | None:
-        """The embedding of a training photo; None for any other."""
+        """The embedding of a training photo; None for any other photo."""
         if name is None:
             return None
-        if self._places is None:  # read once: every step would wait for a GPU to say where its photo is
+        if self._places is None:  # read once, since every read synchronises with a GPU
             self._places = {key: place for place, key in enumerate(self.photo_keys.tolist())}
         place = self._places.get(_key(name))
         return None if place is None else self.photo_embeddings[place]
@@ -203,7 +209,7 @@ class AffineGS(Method):
     def _fit(
         self, photo: Float[Tensor, "H W 3"], camera: Camera, keep: Bool[Tensor, "H W"] | None
     ) -> Float[Tensor, " G"]:
-        """The embedding under which the scene looks most like a photo; the scene itself stays as it is."""
+        """Optimises the embedding of a photo with the scene fixed."""
         embedding = self._mean().detach().clone().requires_grad_()
         optimizer = torch.optim.Adam([embedding], lr=self.config.encode_rate)
         visibility = None if keep is None else keep.to(photo)
@@ -221,7 +227,7 @@ class AffineGS(Method):
         return embedding.detach()
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """Base harmonics, scaled and shifted: colours ``c`` become ``scale * c + offset``."""
+        """Scales and shifts the base harmonics: colours ``c`` become ``scale * c + offset``."""
         stored = self.gaussians.rows
         parts = [stored["sh0"], stored["shN"], stored["embedding"]]
         flat, higher, own = parts if rows is None else [take_rows(part, rows) for part in parts]
@@ -229,7 +235,7 @@ class AffineGS(Method):
         hidden = (hidden + self.from_photo(embeddings.global_embedding)).relu()
         scale, offset = self.output(self.hidden(hidden).relu()).chunk(2, dim=1)
         scale = 1 + scale
-        # Harmonics are colours around grey, which scale and offset move too.
+        # SH colours are relative to grey (0.5), which scale and offset change as well.
         moved = scale * flat[:, 0] + rgb_to_sh0(0.5 * scale + offset)
         return torch.cat([moved[:, None], scale[:, None] * higher], dim=1)
 
@@ -242,7 +248,7 @@ class AffineGS(Method):
         *,
         name: str | None = None,
     ) -> TrainingOutput:
-        """Renders under the photo's embedding; photos that joined after the start train under the mean."""
+        """Renders under the photo's embedding; photos added when resuming use the mean embedding."""
         learnt = self._learnt(name)
         projection = self.gaussians.project(camera, absgrad=stage.absgrad)
         projection.means2d.retain_grad()
@@ -252,7 +258,7 @@ class AffineGS(Method):
 
 
 def _key(name: str) -> int:
-    """Identifies a photo by its name: checkpoints hold tensors alone."""
+    """An integer that identifies a photo by its name, since checkpoints hold tensors only."""
     return int.from_bytes(
         hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()[:8], "big", signed=True
     )

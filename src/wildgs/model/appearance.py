@@ -1,4 +1,4 @@
-"""The light of a photo, apart from the scene it falls on."""
+"""The appearance of a photo, independent of the scene, and its embeddings for the Gaussians."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Appearance:
-    """What `encode` reads from a photo.
+    """The appearance of a photo, the result of `Method.encode`.
 
     Attributes:
-        global_embedding: Emb^g, or None for a method without appearance.
-        planes: Triplane feature maps F^T, or None: then every Gaussian's local embedding is the vector v.
-        visibility: M of the encoded photo (1 = static), or None for a method without a mask.
-        color_map: What the embedding missed of the photo's colours (`wildgs.model.color_match`), or None.
-        basis_weights: What both missed of its light, along `wildgs.model.light_basis`, or None.
+        global_embedding: Emb^g; None for a method without appearance.
+        planes: Triplane feature maps F^T; None: all Gaussians have the local embedding v.
+        visibility: Mask M of the photo (1 = static); None for a method without a mask.
+        color_map: Colour transform that corrects the embedding (`wildgs.model.color_match`), or None.
+        basis_weights: Weights that correct both (`wildgs.model.light_basis`), or None.
     """
 
     global_embedding: Float[Tensor, " G"] | None = None
@@ -31,14 +31,14 @@ class Appearance:
 
 @dataclass(frozen=True)
 class Embeddings:
-    """Appearance carried to the Gaussians: what `fuse` takes and what tuning mixes.
+    """An appearance as embeddings of the Gaussians, for `Method.fuse` and for mixing.
 
     Attributes:
         global_embedding: Emb^g; empty for a method that is not relightable.
         local_embeddings: Emb^l per Gaussian; None for a method without local appearance.
-        color_map: Change [A | b] of all colours, which become ``c + A c + b``; None for none. Where the sky is
-            matched apart, its own change follows (`wildgs.model.color_match.match_sky`).
-        basis_weights: Weights of the components of `wildgs.model.light_basis`; None for none.
+        color_map: Colour transform [A | b] of all Gaussians, ``c + A c + b``, possibly with further columns for
+            light codes and the sky (`wildgs.model.color_match.match_photo`), or None.
+        basis_weights: Weights of the components of `wildgs.model.light_basis`, or None.
     """
 
     global_embedding: Float[Tensor, " G"]
@@ -50,14 +50,14 @@ class Embeddings:
 def blend_embeddings(
     parts: Sequence[Embeddings], weights: Sequence[float], local_weights: Sequence[float] | None = None
 ) -> Embeddings:
-    """Tuning: Σ w_k f_k on global and local embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
+    """Appearance tuning: Σ w_k f_k on embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
 
-    Colour maps and basis weights are of the photo as a whole and mix as global embeddings do.
+    Colour maps and basis weights are mixed like global embeddings.
 
     Args:
         parts: Embeddings for the same Gaussians, at least one.
-        weights: One for each part.
-        local_weights: Weights of the local embeddings where they differ.
+        weights: One weight per part.
+        local_weights: Weights of the local embeddings; None takes `weights`.
     """
     local_weights = weights if local_weights is None else local_weights
     local = [part.local_embeddings for part in parts if part.local_embeddings is not None]
@@ -70,9 +70,9 @@ def blend_embeddings(
 
 
 def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
-    """The mean of `count` embeddings, of which one at a time is in memory.
+    """The mean of `count` embeddings, of which only one is in memory at a time.
 
-    Of colour maps and basis weights it is the mean over the parts that have them.
+    Colour maps and basis weights are averaged over the parts that have them.
     """
     total_global, maps, basis, local_mean = [], [], [], None
     for part in parts:
@@ -89,7 +89,7 @@ def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
 
 
 def _mixed(values: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor | None:
-    """Σ w x, where a part without a value changes nothing."""
+    """Σ w x, with zero for parts without a value."""
     present = [value for value in values if value is not None]
     if not present:
         return None
@@ -97,7 +97,7 @@ def _mixed(values: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor 
 
 
 def _weighted(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
-    """Σ w x; what has weight 0 is not looked at."""
+    """Σ w x, ignoring values of weight 0 (even if they are non-finite)."""
     chosen = [(value, weight) for value, weight in zip(values, weights, strict=True) if weight != 0]
     total = chosen[0][0] * chosen[0][1]
     for value, weight in chosen[1:]:

@@ -1,8 +1,8 @@
-"""Matching a scene's colours to a photo: what the embedding missed of its exposure and colour cast.
+"""Colour match: an affine colour transform between a render and its photo, for exposure and colour cast.
 
-Not in the paper. A network that has seen some ninety photos guesses a new photo's light, and the photo itself says
-how far off the guess is. NeRF-W's line of work optimises the embedding of a new photo for that; an affine map of
-colours is found in closed form, from one render, and brings most of what many steps of optimisation bring.
+Not in the paper. The encoder, trained on a few dozen photos, only approximates the light of a new photo. NeRF-W and
+its successors optimise the embedding of a new photo instead. An affine colour transform is computed in closed form
+from one render and gives most of the improvement of such an optimisation.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from wildgs.model.wrapping import MIN_ALPHA, liftable
 from wildgs.rasterize import Rendering
 
 ROUNDS, TRAINING_ROUNDS = 6, 3
-"""Of reweighting."""
+"""Iterations of iteratively reweighted least squares."""
 RIDGE = 3e-4
-"""Of the least squares, in units of mean squared colour: what a photo does not tell stays as it was."""
+"""Ridge regularisation of the least squares, in units of mean squared colour."""
 OUTLIER = 0.05
-"""Residual at which a pixel counts half (Cauchy's weights): passers-by that the mask has missed."""
+"""Residual at which a pixel's weight is halved (Cauchy weights), for passers-by that the mask has missed."""
 LEAST_PIXELS = 64
-"""Fewer say nothing about a photo's light."""
+"""Smallest number of pixels for a match."""
 
 ELEVATION_ORDERS = 2
-"""Powers of the sine of the elevation by which the sky's colours are matched: it is paler near the horizon."""
+"""Powers of the sine of the elevation in the sky's transform, since the sky is paler near the horizon."""
 SKY_COLUMNS = 4 + ELEVATION_ORDERS
-"""Columns of the sky's change: [A | b] and one for each power."""
+"""Columns of the sky's transform: [A | b] and one for each power."""
 
 
 def elevation_powers(sine: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch E"]:
-    """What the sky's change multiplies its further columns with."""
+    """Factors of the elevation columns of the sky's transform."""
     return torch.stack([sine ** (order + 1) for order in range(ELEVATION_ORDERS)], dim=-1)
 
 
@@ -44,12 +44,12 @@ def mapped(
     change: Float[Tensor, "3 4"],
     offset: Float[Tensor, "V 3"] | float = 0.0,
 ) -> Float[Tensor, "V K 3"]:
-    """Spherical harmonics of colours ``c + A c + b + offset``, by the harmonics of c.
+    """Spherical harmonics of the colours ``c + A c + b + offset``, given those of c.
 
     Args:
-        harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
+        harmonics: Relative to grey (0.5), as in `wildgs.rasterize.sh_to_colors`.
         change: [A | b].
-        offset: Of every Gaussian's colour.
+        offset: Additional offset of every Gaussian's colour.
     """
     matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:, :3]
     flat = rgb_to_sh0(matrix @ torch.full_like(change[:, 3], 0.5) + change[:, 3] + offset)
@@ -69,23 +69,23 @@ def match_photo(
     codes: Float[Tensor, "*pixels L"],
     training: bool = False,
 ) -> Float[Tensor, "3 M"]:
-    """The change that takes a render's colours to its photo's, for the landmark and the sky apart.
+    """Fits the colour transform from a render to its photo, separately for the landmark and the sky.
 
-    Photos are full of sky: one change for all would do to the landmark what the sky needs.
+    A common transform would be dominated by the sky, which covers much of most photos.
 
     Args:
-        photo: In 0..1.
-        rendering: From the photo's camera.
-        visibility: M; of the sky, all pixels that are covered count.
-        keep: The user's own mask: pixels that are False do not count.
-        threshold: Th: pixels with a visibility above it are static.
-        sky: Which pixels show it; None matches all pixels alike.
-        codes: Rendered light codes of the landmark, on which its change depends linearly; L may be 0.
-        training: Gives each channel a gain of its own, no more.
+        photo: RGB in [0, 1].
+        rendering: The render of the photo's camera.
+        visibility: M; not used for the sky.
+        keep: The user's mask: False = ignore the pixel.
+        threshold: Threshold Th of static pixels.
+        sky: Sky pixels; None fits one transform for all pixels.
+        codes: Rendered light codes of the landmark, on which its transform depends linearly; L may be 0.
+        training: Fit a gain per channel (a diagonal A) only.
 
     Returns:
-        Change [A | b | W] of the landmark: colours c become ``c + A c + b + W codes``; with a sky, its change
-        [A | b | E] beside it: ``c + A c + b + E @ elevation_powers(sine)``. Zero where too little is seen.
+        Transform [A | b | W] of the landmark: colours c become ``c + A c + b + W codes``; with a sky, followed by
+        its transform [A | b | E]: ``c + A c + b + E @ elevation_powers(sine)``. Zero if too few pixels are visible.
     """
     static = liftable(visibility, rendering.alpha, threshold)
     covered = rendering.alpha > MIN_ALPHA
@@ -106,13 +106,13 @@ def changed_harmonics(
     sky: Sky | None,
     codes: Float[Tensor, "V L"],
 ) -> Float[Tensor, "V K 3"]:
-    """The harmonics of changed colours.
+    """Applies a colour transform to spherical harmonics.
 
     Args:
-        harmonics: Around grey, as `wildgs.rasterize.sh_to_colors` takes them.
+        harmonics: Relative to grey (0.5), as in `wildgs.rasterize.sh_to_colors`.
         change: From `match_photo`.
-        sky: Which Gaussians stand for it; None as in `match_photo`.
-        codes: Their light codes.
+        sky: Sky Gaussians; None as in `match_photo`.
+        codes: Light codes of the Gaussians.
     """
     own, by_code, of_sky, by_elevation = split_change(change, codes.shape[1])
     below = mapped(harmonics, own, codes @ by_code.T)
@@ -123,7 +123,7 @@ def changed_harmonics(
 
 
 def split_change(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]:
-    """[A | b] of the landmark and what its codes change, the same of the sky and its elevation."""
+    """Splits a transform into [A | b] and W of the landmark, and [A | b] and E of the sky."""
     return change.tensor_split((4, 4 + codes, 8 + codes), dim=1)
 
 
@@ -133,28 +133,28 @@ def _fitted(
     regions: Sequence[tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels _"]]],
     training: bool,
 ) -> list[Float[Tensor, "3 _"]]:
-    """Robust least squares of the photo's difference from the render by the render's colours and further terms.
+    """Robust least squares of photo minus render on the render's colours and further terms.
 
-    In training each channel has a gain of its own and no share in the others. With all nine numbers, training lost
-    the colours of materials: errors of the render weaken what the fit makes of a hue, which then is not learnt.
+    In training, A is diagonal. With a full matrix, colours of materials were lost: errors of the render reduce the
+    saturation of the fit, so that it is not learnt.
 
-    Nothing in it waits for a GPU: pixels that do not count are weighted, not selected. All regions, and channels
-    that have a gain of their own, are solved at once, in few operations, since each is small.
+    There is no synchronisation with a GPU, since pixels are weighted instead of selected. All regions (and
+    channels, if A is diagonal) are solved in one batch.
 
     Args:
-        render: Colours.
-        photo: Likewise.
-        regions: Of each, the weights of pixels, and further terms, of which the first is 1.
-        training: Whether each channel has a gain of its own.
+        render: Rendered colours.
+        photo: Colours of the photo.
+        regions: For each region, weights of the pixels, and further terms, the first of which is 1.
+        training: Whether A is diagonal.
     """
     sizes = [further.shape[-1] for _, further in regions]
     weights = torch.stack([weight.reshape(-1) for weight, _ in regions])
-    # A term that a region lacks is 0, and so is its coefficient.
+    # Regions with fewer terms are padded with zeros, whose coefficients are 0.
     padded = [functional.pad(further, (0, max(sizes) - further.shape[-1])) for _, further in regions]
     further = torch.stack(padded).reshape(len(regions), 1, weights.shape[1], max(sizes))
     colors = render.reshape(-1, 3).clamp(max=1)
     residual = photo.reshape(-1, 3) - colors
-    # Axes: regions, sets of channels that are solved together, pixels, terms and residuals.
+    # Axes: regions, channel groups solved together, pixels, terms and residuals.
     parts = (colors.T[..., None], residual.T[..., None]) if training else (colors[None], residual[None])
     sets, own = parts[0].shape[0], parts[0].shape[2]
     sides = (*further.shape[:1], sets, len(colors), -1)
@@ -167,7 +167,7 @@ def _fitted(
     change, trusted = table.new_zeros(()), base
     for round_ in range(rounds := TRAINING_ROUNDS if training else ROUNDS):
         sums = (terms * trusted[:, None, :, None]).mT @ table
-        # The term that is 1, squared and summed, is the sum of weights.
+        # The weighted sum of the squared constant term is the sum of weights.
         normal = torch.addcdiv(ridge, sums, sums[..., own : own + 1, own : own + 1])
         change = torch.linalg.solve_ex(normal[..., :-own], normal[..., -own:]).result
         if round_ < rounds - 1:

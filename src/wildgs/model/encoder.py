@@ -1,4 +1,4 @@
-"""Encoders of 2D Parsing: frozen SqueezeNet features, or the ResNet-18 of the paper's appendix B, which learns."""
+"""Image encoders of 2D Parsing: frozen SqueezeNet, or the fine-tuned ResNet-18 of the paper's appendix B."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 RESNET_WIDTHS = (64, 64, 128, 256, 512)
 SQUEEZENET_LEVELS = (4, 7, 9, 12)
-"""Layers whose features are read, at 1/4, 1/8, 1/16 and 1/16 of the resolution."""
+"""Layers whose features are used, at 1/4, 1/8, 1/16 and 1/16 of the resolution."""
 SQUEEZENET_WIDTHS = (128, 256, 384, 512)
 LEAST_VARIANCE = 1e-4
-"""Of a level over the collection: what hardly varies (blank photos) is not amplified further."""
+"""Lower bound on the variance of a level over the collection, so that blank photos are not amplified."""
 
 
 class FrozenBatchNorm(nn.Module):
-    """Batch normalisation with statistics that never change after `calibrate` or loading.
+    """Batch normalisation with fixed statistics, set by `calibrate` or loaded.
 
-    The function of a photo is then the same in training and at test time, whatever else is in the batch, and
-    absolute brightness passes through it, which group or instance normalisation would remove.
+    Training and test time then behave the same, and unlike with group or instance normalisation the absolute
+    brightness is preserved.
     """
 
     running_mean: Tensor
@@ -59,10 +59,10 @@ class FrozenBatchNorm(nn.Module):
             # A single value (one small photo, deepest level) has no unbiased variance.
             var = x.var(dim=(0, 2, 3), correction=min(1, x[:, 0].numel() - 1))
             self.running_mean.copy_(mean)
-            # What hardly varies (blank photos) is not blown up: every other photo would then be far off.
+            # Channels with almost no variance (blank photos) are not amplified.
             self.running_var.copy_(var.where(var > 1e-4 * (1 + mean.square()), 1.0))
         if x.device.type != "cpu":
-            # One kernel each way; on CPUs it is the slower one.
+            # One kernel for each pass; slower on CPUs.
             return functional.batch_norm(
                 x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
             )
@@ -72,12 +72,12 @@ class FrozenBatchNorm(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Feature maps of photos.
+    """Computes feature maps of photos.
 
     Attributes:
-        widths: Channels of the maps that `forward` gives.
-        frozen: Whether the network never learns: features of a photo can then be kept (`FeatureCache`).
-        pretrained: Whether the weights are ImageNet's.
+        widths: Channels of the feature maps.
+        frozen: Whether the network is not trained, so that features of a photo can be cached (`FeatureCache`).
+        pretrained: Whether the weights are pretrained on ImageNet.
     """
 
     widths: tuple[int, ...]
@@ -100,13 +100,13 @@ class Encoder(nn.Module):
         raise NotImplementedError
 
     def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
-        """Sets the normalisation statistics of the features from photos of the collection, once."""
+        """Sets the normalisation statistics from photos of the collection."""
 
 
 class SqueezeNetEncoder(Encoder):
     """Frozen SqueezeNet 1.1: four levels of ImageNet features, standardised over the collection.
 
-    The network's weights come with the package and are no part of a checkpoint; the statistics are.
+    The weights ship with the package; checkpoints contain the statistics only.
     """
 
     widths = SQUEEZENET_WIDTHS
@@ -116,20 +116,20 @@ class SqueezeNetEncoder(Encoder):
         super().__init__()
         layers = squeezenet_layers()
         layers.load_state_dict(packaged_weights()[0])
-        # In a tuple: no submodule, so that its weights are neither learnt nor written to checkpoints.
+        # In a tuple, so that it is not a submodule: its weights are neither trained nor stored in checkpoints.
         self._layers = (layers.requires_grad_(False),)
         for level, width in enumerate(self.widths):
             self.register_buffer(f"center{level}", torch.zeros(width))
             self.register_buffer(f"scale{level}", torch.ones(()))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SqueezeNetEncoder:
-        """Moves the weights to where the module is moved."""
+        """Moves the weights together with the module."""
         self._layers[0]._apply(fn, recurse)
         return super()._apply(fn, recurse)
 
     @torch.no_grad()
     def raw(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
-        """Features as the network gives them, rounded to half precision: equal whether they were kept or not."""
+        """Features before standardisation, in half precision, so that cached and fresh features are equal."""
         x, levels = (images - self.mean) / self.std, []
         for position, layer in enumerate(self._layers[0]):
             x = layer(x)
@@ -138,22 +138,22 @@ class SqueezeNetEncoder(Encoder):
         return levels
 
     def standardize(self, raw: list[Tensor]) -> list[Tensor]:
-        """`raw` features with mean 0 a channel and spread 1 a level over the collection."""
+        """Standardises `raw` features: mean 0 per channel and variance 1 per level over the collection."""
         return [
             (x.float() - self.get_buffer(f"center{level}")[:, None, None]) * self.get_buffer(f"scale{level}")
             for level, x in enumerate(raw)
         ]
 
     def forward(self, images: Float[Tensor, "B 3 H W"]) -> list[Tensor]:
-        """Standardised features; they take no gradient."""
+        """Standardised features, without gradient."""
         return self.standardize(self.raw(images))
 
     @torch.no_grad()
     def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
-        """Takes the mean of every channel and the spread of every level from photos of the collection.
+        """Sets the mean of every channel and the variance of every level from photos of the collection.
 
-        One spread for all channels of a level: a channel that hardly varies says little, and amplified it would let
-        the embedding learn single photos by heart.
+        All channels of a level share one variance, because amplified channels of low variance would let the
+        embedding overfit single photos.
         """
         for level, x in enumerate(self.raw(images)):
             variance, mean = torch.var_mean(x.float(), dim=(0, 2, 3), correction=0)
@@ -162,7 +162,7 @@ class SqueezeNetEncoder(Encoder):
 
 
 class ResNetEncoder(Encoder):
-    """ResNet-18 without its classifier; gives the feature maps of the stem and the four stages. It learns."""
+    """ResNet-18 without its classifier, fine-tuned; gives the feature maps of the stem and the four stages."""
 
     widths = RESNET_WIDTHS
 
@@ -182,7 +182,7 @@ class ResNetEncoder(Encoder):
 
     @torch.no_grad()
     def calibrate(self, images: Float[Tensor, "B 3 H W"]) -> None:
-        """Sets the normalisation statistics of a fresh encoder; a pretrained one keeps those that it came with."""
+        """Sets the normalisation statistics of an untrained encoder; a pretrained one keeps its own."""
         if self.pretrained:
             return
         norms = [m for m in self.modules() if isinstance(m, FrozenBatchNorm)]
@@ -194,26 +194,26 @@ class ResNetEncoder(Encoder):
 
 
 def encoder_of(state: Mapping[str, Tensor], prefix: str) -> Encoder:
-    """An encoder of the kind that a checkpoint holds, whose tensors are still to be loaded.
+    """Creates an encoder of the type in a checkpoint, before its tensors are loaded.
 
     Args:
         state: The checkpoint's tensors.
-        prefix: Of the names of the encoder's tensors.
+        prefix: Prefix of the names of the encoder's tensors.
     """
     return SqueezeNetEncoder() if f"{prefix}center0" in state else load_encoder(None)
 
 
 def load_encoder(source: str | None = SQUEEZENET) -> Encoder:
-    """The frozen SqueezeNet, or a ResNet-18 from a folder, the Hugging Face cache or the hub, in this order.
+    """Loads the frozen SqueezeNet, or a ResNet-18 from a folder, the Hugging Face cache or the hub.
 
-    Where a ResNet-18's weights cannot be found, one `WildGSWarning` says so, and it starts from random weights.
+    If the weights of the ResNet-18 are not available, warns and initialises them randomly.
 
     Args:
-        source: `SQUEEZENET`; else a ResNet-18: a folder in the hub's layout, a hub name, or None for random weights
-            without a warning.
+        source: `SQUEEZENET`; or, for a ResNet-18, a folder in the hub's layout, a name on the hub, or None for
+            random weights without a warning.
 
     Raises:
-        UserError: `source` is an existing folder that does not hold a ResNet-18.
+        UserError: `source` is an existing folder without a ResNet-18.
     """
     if source == SQUEEZENET:
         return SqueezeNetEncoder()
@@ -225,7 +225,7 @@ def load_encoder(source: str | None = SQUEEZENET) -> Encoder:
             return ResNetEncoder(resnet, pretrained=True)
         warnings.warn(
             f"no ImageNet weights for the encoder ({source} is neither cached nor reachable): masks and global "
-            f"embeddings are learnt from scratch and will be weaker; get them with `hf download {source}`",
+            f"embeddings are learnt from scratch and will be worse; download them by `hf download {source}`",
             WildGSWarning,
             stacklevel=2,
         )
@@ -242,16 +242,18 @@ def _pretrained_resnet(source: str) -> ResNetModel | None:
         try:
             resnet = ResNetModel.from_pretrained(source, local_files_only=True, use_safetensors=True)
         except (OSError, ValueError, RuntimeError) as error:
-            raise UserError(f"{source} does not hold a ResNet-18 in the hub's layout: {error}") from error
+            raise UserError(f"{source} does not contain a ResNet-18 in the hub's layout: {error}") from error
         if tuple(resnet.config.hidden_sizes or ()) != RESNET_WIDTHS[1:]:
-            raise UserError(f"{source} holds another network than ResNet-18; give the folder of {RESNET18}")
+            raise UserError(
+                f"{source} contains another network than ResNet-18; give the folder of {RESNET18}"
+            )
         return resnet
     for local in (True, False):
         if not local and not hub_reachable():
             return None
         try:
             return ResNetModel.from_pretrained(source, local_files_only=local, use_safetensors=True)
-        except Exception:  # the hub's client raises many kinds of errors; all of them mean 'not to be had'
+        except Exception:  # the hub's client raises many types of errors if the network is not available
             continue
     return None
 

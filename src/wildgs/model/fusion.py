@@ -1,4 +1,4 @@
-"""The fusion network M^F (paper, Hierarchical Appearance Modeling): three features to spherical harmonics."""
+"""The fusion network M^F (paper, Hierarchical Appearance Modeling), which predicts spherical harmonics."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from wildgs.model.precision import MixedModule
 
 PARTS = 128
 LEAST_ROWS = 64 * PARTS
-"""Fewer rows are one product."""
+"""Smallest number of rows for `SplitLinear`."""
 
 
 def linear_over_rows(
     rows: Float[Tensor, "N I"], weight: Float[Tensor, "O I"], bias: Float[Tensor, " O"]
 ) -> Float[Tensor, "N O"]:
-    """``rows @ weight.T + bias``, one row per Gaussian, in the precision of the rows, or of autocast."""
+    """``rows @ weight.T + bias``, one row per Gaussian, in the precision of the rows or of autocast."""
     if rows.is_cuda and len(rows) >= LEAST_ROWS and features.is_on("split_weights"):
         return SplitLinear.apply(rows, weight.to(rows.dtype), bias.to(rows.dtype))
     return functional.linear(rows, weight, bias)
 
 
 class SplitLinear(torch.autograd.Function):
-    """`torch.nn.functional.linear` of operands of one dtype, whose weight gradient is summed in `PARTS` parts.
+    """`torch.nn.functional.linear` whose weight gradient is summed in `PARTS` parts, for operands of one dtype.
 
-    The gradient of a weight of 64 x 48 numbers reduces over all Gaussians in one product: a single tile of the
-    result, on which few of a GPU's multiprocessors can work.
+    The gradient of a small weight matrix (64 x 48) is a reduction over all Gaussians. As one product it has a
+    single output tile, which occupies few of a GPU's multiprocessors.
     """
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Rows [N, I], weight [O, I] and bias [O] to [N, O]."""
+        """Computes [N, O] from rows [N, I], weight [O, I] and bias [O]."""
         ctx.save_for_backward(rows, weight)
         return functional.linear(rows, weight, bias)
 
@@ -60,10 +60,10 @@ class SplitLinear(torch.autograd.Function):
 class Fusion(MixedModule):
     """sh_i = M^F(Emb^g ⊕ Emb^l_i ⊕ f^in_i), shared by all Gaussians.
 
-    A linear path from the intrinsic feature to the output runs beside the hidden layers. At the start it copies
-    the feature's first three entries to the flat part of the harmonics; `initial_intrinsic` puts the SfM point's
-    colour there, and the hidden layers add little, so training begins near the point cloud's colours. What comes
-    out is mapped by the photo's colour transform, which begins as the identity.
+    A linear skip connection leads from the intrinsic feature to the output. Initially it copies the feature's first
+    three entries, which `initial_intrinsic` sets to the colour of the SfM point, to SH degree 0, and the hidden
+    layers add little, so that training starts near the colours of the point cloud. The photo's colour transform,
+    initially the identity, is applied to the output.
     """
 
     def __init__(self, config: FusionConfig, global_size: int, local_size: int) -> None:
@@ -88,7 +88,7 @@ class Fusion(MixedModule):
             nn.init.zeros_(self.transform.bias)
 
     def initial_intrinsic(self, colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P I"]:
-        """Intrinsic features with which the colours come out flat: their SH constants, then small noise."""
+        """Initial intrinsic features: the SH coefficients of the colours, followed by small noise."""
         rows = 0.1 * torch.randn(len(colors), self.config.intrinsic_size)
         rows[:, :3] = rgb_to_sh0(colors)
         return rows
@@ -102,13 +102,13 @@ class Fusion(MixedModule):
     ) -> Float[Tensor, "N K 3"]:
         """SH coefficients of every Gaussian.
 
-        The first layer is split: the global embedding's share is the same for all Gaussians and computed once.
+        The first layer is split, since the contribution of the global embedding is the same for all Gaussians.
 
         Args:
             global_embedding: Emb^g.
             local_embeddings: Emb^l.
             intrinsic: f^in.
-            color_map: A further change [A | b] of all colours, after the colour transform.
+            color_map: Another colour transform [A | b], applied after the predicted one.
         """
         output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         with self.mixed(intrinsic.device):
@@ -116,7 +116,7 @@ class Fusion(MixedModule):
             hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
             fused = linear_over_rows(hidden, output, bias)
         fused = fused.float()
-        if direct is not None:  # it carries the base colour and stays in full precision
+        if direct is not None:  # in full precision, because it contains the base colour
             fused = torch.addmm(fused, intrinsic, direct.T)
         return fused.reshape(-1, self.coefficients, 3)
 
@@ -126,23 +126,21 @@ class Fusion(MixedModule):
         local_embeddings: Float[Tensor, "N L"],
         intrinsic: Float[Tensor, "N I"],
     ) -> Float[Tensor, "N H"]:
-        """Before its rectifier."""
+        """The first layer before its ReLU."""
         of_all, weight = self.first_global(global_embedding), self.first_rows.weight
         intrinsic = intrinsic.to(self.precision)
-        if (
-            local_embeddings.stride(0) == 0 and len(local_embeddings) > 1
-        ):  # v, expanded: the same for all as well
+        if local_embeddings.stride(0) == 0 and len(local_embeddings) > 1:  # the expanded v, the same for all
             local = local_embeddings.shape[1]
             of_all = of_all + functional.linear(local_embeddings[:1], weight[:, :local])[0]
             return linear_over_rows(intrinsic, weight[:, local:], of_all)
-        # In the precision of the product that reads them: to join them first would cost a copy of both in full.
+        # Converted before concatenation, which would otherwise copy both in full precision.
         rows = torch.cat([local_embeddings.to(self.precision), intrinsic], dim=1)
         return linear_over_rows(rows, weight, of_all)
 
     def _change(
         self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None
     ) -> Float[Tensor, "3 4"] | None:
-        """[A | b] of the colour transform and the colour map after it, as one; None where there is neither."""
+        """The colour transform followed by the colour map as one transform [A | b]; None if there is neither."""
         if self.transform is None:
             return color_map
         first = self.transform(global_embedding)
@@ -154,16 +152,16 @@ class Fusion(MixedModule):
     def _last_layers(
         self, change: Float[Tensor, "3 4"] | None
     ) -> tuple[Float[Tensor, "O H"], Float[Tensor, "O I"] | None, Float[Tensor, " O"]]:
-        """Weights of the output and the direct path, and their bias, with a change of colours taken in.
+        """Weights of the output and the skip connection, and their bias, multiplied by a colour transform.
 
-        All three are linear, so that colours ``c + A c + b`` cost no pass over the Gaussians.
+        All three are linear, so the transform ``c + A c + b`` needs no pass over the Gaussians.
         """
         output, bias = self.output.weight, self.output.bias
         direct = None if self.direct is None else self.direct.weight
         if change is None:
             return output, direct, bias
         matrix = torch.eye(3, dtype=change.dtype, device=change.device) + change[:, :3]
-        # Harmonics are colours around grey, which the change moves too.
+        # SH colours are relative to grey (0.5), which the transform changes as well.
         flat = rgb_to_sh0(matrix @ torch.full_like(change[:, 3], 0.5) + change[:, 3])
 
         def colors_mapped(weight: Float[Tensor, "O X"]) -> Float[Tensor, "O X"]:

@@ -1,4 +1,4 @@
-"""The explicit scene: N Gaussians, each a row in every per-Gaussian parameter."""
+"""The Gaussians and their per-Gaussian parameters."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from wildgs.rasterize import EPS2D, Projection, project
 
 INITIAL_OPACITY = 0.1
 NEAR = 0.05
-"""Near plane; the aligned frame's unit is the photos' median depth. What people in the way leave behind floats
-right before single cameras: nearer than this there is nothing of a landmark to see."""
-
+"""Near plane in units of the aligned frame (median depth of the photos = 1). Closer Gaussians are floaters, caused
+by passers-by, in front of single cameras."""
 
 GEOMETRY_ROWS: dict[str, tuple[int, ...]] = {
     "means": (3,),
@@ -24,25 +23,25 @@ GEOMETRY_ROWS: dict[str, tuple[int, ...]] = {
     "log_scales": (3,),
     "opacity_logits": (),
 }
-"""Rows that every method has, with the shape of one Gaussian's entry."""
+"""Per-Gaussian parameters that every method has, with the shape of one entry."""
 
 
 class Gaussians(nn.Module):
-    """Geometry of the Gaussians plus whatever per-Gaussian features a method adds.
+    """Geometry of the Gaussians, and the per-Gaussian features of a method.
 
-    Every parameter in `rows` has N rows. Densification edits all of them together, so a feature that is
-    registered here travels with clone, split and prune without further care.
+    Every parameter in `rows` has N rows, and densification edits all of them, so that features need no further code
+    for cloning, splitting and pruning.
 
-    Stored values are raw: `log_scales` (exp gives world units), `opacity_logits` (sigmoid gives opacity),
-    `quats` (w, x, y, z, not normalised).
+    Values are stored before activation: `log_scales` (exp), `opacity_logits` (sigmoid), `quats` (w, x, y, z, not
+    normalised).
 
     Attributes:
         rows: All parameters.
-        eps2d: With which they are projected; see `wildgs.rasterize.project`.
+        eps2d: Added to the diagonal of 2D covariances; see `wildgs.rasterize.project`.
     """
 
     def __init__(self, rows: dict[str, Tensor]) -> None:
-        """Takes the initial values of all rows, `GEOMETRY_ROWS` among them."""
+        """Creates the parameters from initial values, which include `GEOMETRY_ROWS`."""
         super().__init__()
         self.eps2d = EPS2D
         self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})
@@ -62,7 +61,7 @@ class Gaussians(nn.Module):
 
     @property
     def scales(self) -> Float[Tensor, "N 3"]:
-        """Standard deviations along the Gaussian's own axes, world units."""
+        """Standard deviations along the principal axes, world units."""
         return self.rows["log_scales"].exp()
 
     @property
@@ -73,7 +72,7 @@ class Gaussians(nn.Module):
     def project(
         self, camera: Camera, *, absgrad: bool = False, factors: Float[Tensor, "N"] | None = None
     ) -> Projection:
-        """Projects and bins all Gaussians for one camera; `factors` multiply their opacities, up to 0.999."""
+        """Projects and bins all Gaussians for one camera; `factors` multiply opacities (at most 0.999)."""
         opacities = self.opacities if factors is None else (self.opacities * factors).clamp(max=0.999)
         return project(
             self.means,
@@ -88,7 +87,7 @@ class Gaussians(nn.Module):
 
 
 def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
-    """Initial geometry as 3D Gaussian Splatting starts: round Gaussians as wide as their neighbours are far.
+    """Initial geometry as in 3DGS: isotropic Gaussians whose size is the distance to their neighbours.
 
     Args:
         points: Sparse SfM points, world units.
@@ -114,11 +113,11 @@ def geometry_from_points(points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
 
 
 ROWS_STEP = 1024
-"""Rows are shaded in multiples of this on the CPU, where libraries compile a matrix product for every new shape."""
+"""On the CPU, rows are shaded in multiples of this, because oneDNN compiles matrix products for every new shape."""
 
 
 def rows_to_shade(visible: Bool[Tensor, "N"]) -> Int[Tensor, " V"]:
-    """Indices of the visible Gaussians; on the CPU also of a few others, up to a multiple of `ROWS_STEP`."""
+    """Indices of the visible Gaussians, on the CPU padded by others to a multiple of `ROWS_STEP`."""
     rows = visible.nonzero()[:, 0]
     if visible.device.type != "cpu":
         return rows
@@ -129,9 +128,9 @@ def rows_to_shade(visible: Bool[Tensor, "N"]) -> Int[Tensor, " V"]:
 
 
 def take_rows(values: Float[Tensor, "N *rest"], rows: Int[Tensor, " V"]) -> Float[Tensor, "V *rest"]:
-    """``values[rows]`` for indices of which none comes twice.
+    """``values[rows]`` for unique indices.
 
-    Its gradient is then written, not added up: indexing would sort the indices on a GPU to add in a fixed order.
+    The gradient is written without accumulation, for which indexing would sort the indices on a GPU.
     """
     return _TakeRows.apply(values, rows)
 
@@ -139,7 +138,7 @@ def take_rows(values: Float[Tensor, "N *rest"], rows: Int[Tensor, " V"]) -> Floa
 def spread_rows(
     values: Float[Tensor, "V *rest"], rows: Int[Tensor, " V"], count: int
 ) -> Float[Tensor, "N *rest"]:
-    """The reverse of `take_rows`: values at their Gaussians' places, zero for the others."""
+    """The inverse of `take_rows`; other Gaussians get zero."""
     return values.new_zeros(count, *values.shape[1:]).index_copy(0, rows, values)
 
 

@@ -1,4 +1,4 @@
-"""The first Gaussians: on SfM points, on depth priors, on the ground and in the sky, within one budget."""
+"""The initial Gaussians: on SfM points, on surfaces of depth maps, on the ground plane and in the sky."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
 """Positions in the aligned frame, and 8-bit colours."""
 
 GROUND_WIDTH, GROUND_THICKNESS = 0.6, 0.1
-"""Standard deviations along and across the ground, in units of the spacing: neighbours overlap."""
+"""Standard deviations along and across the ground, in units of the spacing, so that neighbours overlap."""
 GROUND_OPACITY = 0.7
 
 
 @dataclass(frozen=True)
 class InitialGaussians:
-    """What a method is created from.
+    """Initial geometry and colours, from which a method is created.
 
     Attributes:
-        rows: Geometry of all first Gaussians: means, quats, log_scales, opacity_logits.
+        rows: Geometry of all initial Gaussians: means, quats, log_scales, opacity_logits.
         colors: Their colours, RGB in [0, 1].
         points: The SfM points among them, in the aligned frame.
-        point_colors: Colours of those, RGB in [0, 1].
+        point_colors: Colours of the SfM points, RGB in [0, 1].
         photos: Names of the training photos.
     """
 
@@ -48,37 +48,37 @@ class InitialGaussians:
 
 @dataclass(frozen=True)
 class InitialBudget:
-    """How `max_gaussians` is shared among the first Gaussians.
+    """Divides `max_gaussians` among the initial Gaussians.
 
-    The sky takes a sixth at most, and SfM points three quarters of what it leaves. Depth points take at most half
-    of what then remains, and the ground half of what they leave: the rest is for densification.
+    The sky gets at most a sixth, SfM points at most three quarters of the rest, depth points at most half of what
+    then remains, and the ground at most half of what they leave. Densification uses the remainder.
     """
 
     max_gaussians: int
 
     def sky(self, wanted: int) -> int:
-        """Gaussians of the sky."""
+        """Number of sky Gaussians."""
         return min(wanted, self.max_gaussians // 6)
 
     def sfm(self, found: int, sky: int) -> int:
-        """Gaussians on SfM points; at least one."""
+        """Number of Gaussians on SfM points; at least one."""
         return min(found, max(1, 3 * (self.max_gaussians - sky) // 4))
 
     def further(self, wanted: int, taken: int) -> int:
-        """Depth points, or the ground's, where `taken` Gaussians are placed already."""
+        """Number of depth points or ground points when `taken` Gaussians are placed already."""
         return min(wanted, max(0, self.max_gaussians - taken) // 2)
 
 
 def initial_gaussians(
     scene: Scene, config: InitialConfig, max_gaussians: int, seed: int = 0
 ) -> InitialGaussians:
-    """All first Gaussians of a scene.
+    """Creates all initial Gaussians of a scene.
 
     Args:
-        scene: Its SfM points, and its training photos with their depth priors.
-        config: What is placed beside the SfM points.
-        max_gaussians: Bound on all of them together; `InitialBudget` says how it is shared.
-        seed: Of random choices.
+        scene: The scene with SfM points and depth maps of training photos.
+        config: Initial Gaussians in addition to those on SfM points.
+        max_gaussians: Upper bound on their total number, divided by `InitialBudget`.
+        seed: Random seed.
     """
     budget = InitialBudget(max_gaussians)
     sky = replace(config.sky, points=budget.sky(config.sky.points))
@@ -88,10 +88,12 @@ def initial_gaussians(
     dense = depth_points(scene, wanted, seed)
     taken += len(dense[0])
     wanted_ground = replace(config.ground, points=budget.further(config.ground.points, taken))
-    known, painted = (torch.cat(both) for both in zip(sparse, dense, strict=True))
+    points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
     centers = [view.camera.position for view in scene.train_views]
-    nothing = (known[:0], painted[:0])
-    ground = ground_points(known, painted, torch.stack(centers), wanted_ground, seed) if centers else nothing
+    no_points = (points[:0], colors[:0])
+    ground = (
+        ground_points(points, colors, torch.stack(centers), wanted_ground, seed) if centers else no_points
+    )
     names = [view.name for view in scene.train_views]
     return initial_from_points(replace(config, sky=sky), *sparse, dense=dense, ground=ground, photos=names)
 
@@ -105,20 +107,20 @@ def initial_from_points(
     ground: ColoredPoints | None = None,
     photos: Sequence[str] = (),
 ) -> InitialGaussians:
-    """First Gaussians on points that are known already.
+    """Creates initial Gaussians from given points, and the sky.
 
     Args:
-        config: Of the sky and the ground's spacing.
+        config: Configuration of the sky, and of the ground's spacing.
         points: SfM points in the aligned frame.
         colors: Their colours.
-        dense: Further points, from depth priors.
-        ground: Points that continue the ground.
+        dense: Further points from depth maps.
+        ground: Points that extend the ground plane.
         photos: Names of the training photos.
     """
-    surface, painted = points, colors
+    surface, surface_colors = points, colors
     if dense is not None:
-        surface, painted = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
-    parts = [(geometry_from_points(surface), painted.float() / 255)]
+        surface, surface_colors = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
+    parts = [(geometry_from_points(surface), surface_colors.float() / 255)]
     if ground is not None:
         parts.append((ground_rows(ground[0], config.ground.spacing), ground[1].float() / 255))
     if config.sky.points:
@@ -133,10 +135,10 @@ def initial_from_points(
 
 
 def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tensor]:
-    """Geometry of the ground's Gaussians: thin level discs, opaque from the start.
+    """Geometry of the ground's Gaussians: thin horizontal discs, initially nearly opaque.
 
     Args:
-        points: Their centres in the aligned frame, +z up.
+        points: Their centres in the aligned frame.
         spacing: Distance between neighbours, world units.
     """
     count = len(points)
@@ -150,14 +152,14 @@ def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tenso
 
 
 def sky_rows(config: SkyConfig, points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
-    """Geometry of the sky's Gaussians, round and as wide as their spacing, around the scene's SfM points."""
+    """Geometry of the sky's Gaussians: isotropic, as large as their spacing, around the scene's SfM points."""
     rows = geometry_from_points(sky_points(config, points))
     rows["opacity_logits"] = torch.full((config.points,), config.opacity).logit()
     return rows
 
 
 def _thinned(scene: Scene, allowed: int, seed: int) -> ColoredPoints:
-    """The scene's SfM points, or a random choice of `allowed` where there are more."""
+    """The scene's SfM points, or a random selection of `allowed` of them."""
     count = len(scene.points)
     if count <= allowed:
         return scene.points, scene.point_colors

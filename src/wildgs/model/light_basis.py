@@ -1,9 +1,9 @@
-"""The lights of the training photos as a basis, in which the light of a photo is fitted in closed form.
+"""Light basis: principal components of the training photos' lights, in which a photo's light is fitted.
 
-Not in the paper. The networks guess a photo's light in one pass, and most of the error that remains is of low
-frequency: light, not structure. What the lights of a collection have in common (the sun moves, clouds close, lamps
-go on) are a few directions in the space of all Gaussians' harmonics: their principal components. How far a photo
-lies along each of them is a linear least-squares problem, as in the morphable models of Blanz and Vetter 1999.
+Not in the paper. The networks predict a photo's light in one pass, and most of the remaining error is of low
+frequency: light, not structure. The lights of a collection (position of the sun, clouds, lamps) vary mostly along a
+few directions in the space of all Gaussians' harmonics, their principal components. Fitting a photo in this basis
+is a linear least-squares problem, as in the morphable models of Blanz and Vetter (1999).
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from wildgs.model.wrapping import liftable
 from wildgs.rasterize import Projection, blend
 
 MOST_LIGHTS = 96
-"""Photos whose lights are looked at; of larger collections as many, evenly spread."""
+"""Upper bound on the number of photos whose lights are used, an even selection of larger collections."""
 LIGHTS_BYTES, BASIS_BYTES = 2**31, 2**29
-"""Limits of all lights while the basis is learnt, and of the basis that is kept."""
+"""Limits of the memory for all lights while the basis is computed, and for the basis."""
 RIDGE = 5e-6
-"""Of the least squares, per squared standard deviation of the training photos along a component."""
+"""Ridge regularisation, per squared standard deviation of the training photos along a component."""
 OUTLIER = 0.1
-"""Residual at which a pixel counts half (Cauchy's weights)."""
+"""Residual at which a pixel's weight is halved (Cauchy weights)."""
 ROUNDS = 4
 LEAST_PIXELS = 64
-"""Fewer say nothing about a photo's light."""
+"""Smallest number of pixels for a fit."""
 ROWS_AT_ONCE = 65_536
 
 
@@ -41,30 +41,29 @@ class LightBasis(nn.Module):
     """Principal components of the harmonics of all Gaussians over the training photos.
 
     Attributes:
-        components: B, N Gaussians, K harmonics, RGB, each scaled to one standard deviation, in half precision; None
-            until `learn`.
+        components: B components of one standard deviation each, in half precision; None before `learn`.
     """
 
     components: Float[Tensor, "B N K 3"] | None
 
     def __init__(self) -> None:
-        """Sets up an empty `LightBasis`."""
+        """Creates an empty basis."""
         super().__init__()
         self.register_buffer("components", None)
 
     @staticmethod
     def affordable_lights(count: int, harmonics: int) -> int:
-        """How many lights of `count` Gaussians' `harmonics` (per channel) fit into `LIGHTS_BYTES`."""
+        """Number of lights of `count` Gaussians, with `harmonics` per channel, that fit into `LIGHTS_BYTES`."""
         return min(MOST_LIGHTS, LIGHTS_BYTES // (6 * harmonics * max(count, 1)))
 
     @torch.no_grad()
     def learn(self, lights: Iterable[Float[Tensor, "N K 3"]], gaussians: Gaussians, size: int) -> None:
-        """Replaces the components by those of some lights; fewer than three lights leave none.
+        """Computes the principal components of lights; fewer than three lights give none.
 
         Args:
-            lights: Harmonics of all Gaussians under the light of one photo each.
-            gaussians: Which of them count how much.
-            size: Number of components, B; less where `BASIS_BYTES` do not hold as many.
+            lights: Harmonics of all Gaussians under the light of each photo.
+            gaussians: The Gaussians, which are weighted by their visibility.
+            size: Number of components, B; reduced if they do not fit into `BASIS_BYTES`.
         """
         self.components = None
         stacked = [light.half() for light in lights]
@@ -90,22 +89,21 @@ class LightBasis(nn.Module):
     def harmonics(
         self, weights: Float[Tensor, " B"], rows: Int[Tensor, " V"] | None = None
     ) -> Float[Tensor, "N K 3"]:
-        """What weights add to the harmonics of the given Gaussians (None: of all)."""
+        """The weighted sum of the components for the given Gaussians (None: for all)."""
         assert self.components is not None
         chosen = self.components if rows is None else self.components[:, rows]
         return (weights.to(chosen.dtype) @ chosen.flatten(1)).float().reshape(chosen.shape[1:])
 
     @torch.no_grad()
     def fit(self, method: Method, sight: Sight, appearance: Appearance) -> Appearance:
-        """Adds the weights that bring the render under an appearance nearest to the photo.
+        """Adds the weights with which the render under an appearance best matches the photo.
 
-        Robust ridge regression: its prior is that a photo's light differs from the guess by no more than training
-        photos differ from one another.
+        Robust ridge regression; its prior is the variation among the training photos.
 
         Args:
-            method: Shades and renders.
+            method: The method, for shading and rendering.
             sight: The photo.
-            appearance: The guess.
+            appearance: The appearance predicted by the networks.
         """
         if self.components is None:
             return appearance
@@ -124,7 +122,7 @@ class LightBasis(nn.Module):
         return replace(appearance, basis_weights=fit_weights(images, residual, counts))
 
     def _images(self, projection: Projection, means: Float[Tensor, "N 3"]) -> Float[Tensor, "B H W 3"]:
-        """Pictures of the components."""
+        """Renders the components."""
         assert self.components is not None
         rows = projection.visible.nonzero()[:, 0]
         towards = means[rows] - projection.camera.position
@@ -140,12 +138,12 @@ class LightBasis(nn.Module):
 def fit_weights(
     images: Float[Tensor, "B H W 3"], residual: Float[Tensor, "H W 3"], counts: Float[Tensor, "H W"]
 ) -> Float[Tensor, " B"]:
-    """Weights of pictures whose sum is nearest to a residual, by robust ridge regression.
+    """Weights of images whose sum best matches a residual, by robust ridge regression.
 
     Args:
-        images: One standard deviation along each component.
-        residual: Photo less render.
-        counts: How much each pixel counts, 0 or more.
+        images: Renders of the components.
+        residual: Photo minus render.
+        counts: Weight of each pixel, 0 or more.
     """
     chosen = counts > 0
     terms, target, base = images[:, chosen], residual[chosen], counts[chosen]
@@ -165,7 +163,7 @@ def fit_weights(
 
 
 def _importance(gaussians: Gaussians) -> Float[Tensor, " N"]:
-    """Share of each Gaussian in what there is to see: opacity by the solid angle from the middle of the scene."""
+    """Relative visibility of each Gaussian: opacity times solid angle from the scene's centre."""
     largest = gaussians.scales.topk(2, dim=-1).values.prod(dim=-1)
     distance = (gaussians.means - gaussians.means.median(dim=0).values).norm(dim=-1).clamp_min(1)
     seen = gaussians.opacities * largest / distance.square()

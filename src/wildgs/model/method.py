@@ -1,6 +1,6 @@
-"""The contract of a method: what it declares, and how it encodes, shades and renders.
+"""The interface of a method: its declarations, and how it encodes, shades and renders.
 
-The trainer, the evaluation and all tools work with any `Method`; docs/methods.md says how to add one.
+The trainer, the evaluation and all tools work with any `Method`; docs/methods.md explains how to add one.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from wildgs.rasterize import Projection, Rendering, blend, sh_to_colors
 
 
 class Method(nn.Module, ABC):
-    """A set of Gaussians and a way to colour them.
+    """A set of Gaussians and a model of their colours.
 
     Attributes:
-        name: On the command line, in `config.yaml` and in the registry.
-        label: In tables and on pages.
-        Config: Frozen dataclass of the method's options; it is the entry `model` of a run's configuration.
-        memory: What training takes.
-        relightable: Whether photos have a say in the colours; if not, there is one light only.
+        name: Name on the command line, in `config.yaml` and in the registry.
+        label: Name in tables and on web pages.
+        Config: Frozen dataclass of the method's options, the entry `model` of a run's configuration.
+        memory: Memory use of training.
+        relightable: Whether colours depend on an appearance.
         gaussians: The Gaussians.
         config: An instance of `Config`.
-        reset_every: Steps between opacity resets in a run of 30,000, where the schedule names none; 0 for none.
-        density: Strategy of density control, where the configuration names none.
-        sh_degree: Degree of the spherical harmonics that `shade` gives.
+        reset_every: Default of steps between opacity resets, for a run of 30,000 steps; 0 for none.
+        density: Default strategy of density control.
+        sh_degree: Degree of the spherical harmonics returned by `shade`.
         global_size: Length of the global embedding; 0 for a method that is not relightable.
-        local_size: Length of the local embeddings; 0 for a method that has none.
-        mask_threshold: Th: pixels with a visibility above it count as static.
+        local_size: Length of the local embeddings; 0 for a method without them.
+        mask_threshold: Threshold Th: pixels with a higher visibility are static.
         depth_supervised: Whether the depth loss applies to this method.
     """
 
@@ -68,73 +68,76 @@ class Method(nn.Module, ABC):
         """Number of basis weights of an appearance; 0 for a method that fits none."""
         return 0
 
-    # What a method declares.
+    # Declarations.
 
     @classmethod
     @abstractmethod
     def rows(cls, config: Any) -> dict[str, tuple[int, ...]]:
-        """All per-Gaussian parameters: from the row's name to the shape of one entry; holds `GEOMETRY_ROWS`."""
+        """Names of all per-Gaussian parameters, including `GEOMETRY_ROWS`, and the shapes of one entry."""
 
     @classmethod
     def initial(cls, config: Any) -> InitialConfig:
-        """Which first Gaussians the method wants beside those on SfM points; by default none."""
+        """Initial Gaussians in addition to those on SfM points; by default none."""
         return InitialConfig.sfm_only()
 
     @classmethod
     @abstractmethod
     def create(cls, config: Any, initial: InitialGaussians) -> Method:
-        """A method at its start, on the first Gaussians and with the scene's points and photos."""
+        """Creates an untrained method from initial Gaussians."""
 
     @classmethod
     @abstractmethod
     def blank(cls, config: Any, gaussians: Gaussians, state: Mapping[str, Tensor]) -> Method:
-        """A method into which a checkpoint's tensors are loaded next; reads no pretrained weights.
+        """Creates a method for loading a checkpoint, without reading pretrained weights.
 
-        `gaussians` have the checkpoint's rows; `state` holds all its tensors, for shapes that only they determine.
+        Args:
+            config: Configuration.
+            gaussians: The checkpoint's Gaussians.
+            state: All tensors of the checkpoint, for shapes that only they determine.
         """
 
     @classmethod
     def from_points(
         cls, config: Any, points: Float[Tensor, "P 3"], colors: UInt8[Tensor, "P 3"], **options: Any
     ) -> Method:
-        """A method at its start on SfM points (aligned frame, 8-bit colours), without priors and budget."""
+        """Creates an untrained method from SfM points (aligned frame, 8-bit colours), without other priors."""
         return cls.create(config, initial_from_points(cls.initial(config), points, colors), **options)
 
     @abstractmethod
     def row_rates(self) -> dict[str, LearningRate]:
-        """Learning rates of the rows beyond `GEOMETRY_ROWS`, whose rates are the optimiser's own."""
+        """Learning rates of all rows except `GEOMETRY_ROWS`."""
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Parameters that are no rows, with their learning rates; by default none."""
+        """Parameters that are not per-Gaussian, with their learning rates; by default none."""
         return []
 
     @property
     def num_gaussians(self) -> int:
-        """N."""
+        """Number of Gaussians, N."""
         return len(self.gaussians)
 
     def sky(self) -> Bool[Tensor, " N"] | None:
-        """Which Gaussians stand for the sky; None where the method does not tell."""
+        """Mask of the sky Gaussians; None if the method does not know them."""
         return None
 
     def growable(self) -> Bool[Tensor, " N"] | None:
-        """Which Gaussians densification may clone, split, reset and prune; None for all."""
+        """Mask of the Gaussians that densification may clone, split, reset and prune; None for all."""
         return None
 
     # Encode, shade, render.
 
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
-        """Looks at some training photos (RGB in [0, 1]) once, before the first step."""
+        """Initialises from some training photos (RGB in [0, 1]), once before the first step."""
 
     def final_photos(self) -> int:
-        """How many training photos `finish` looks at, at most."""
+        """Upper bound on the number of training photos for `finish`."""
         return 0
 
     def finish(self, photos: Iterable[SeenPhoto]) -> None:
-        """Looks at `final_photos` training photos, evenly spread, after the last step.
+        """Processes `final_photos` training photos, an even selection, after the last step.
 
         Args:
-            photos: Read one at a time. None where training continues: what was learnt from them is forgotten.
+            photos: The photos, read one at a time. Empty when training continues: the earlier result is discarded.
         """
 
     def encode(
@@ -147,26 +150,26 @@ class Method(nn.Module, ABC):
         trust_mask: bool = True,
         explicit: bool = True,
     ) -> Appearance:
-        """Reads the appearance of a photo; by default none, for a method that is not relightable.
+        """Computes the appearance of a photo; by default none, for a method that is not relightable.
 
         Args:
             photo: RGB in [0, 1].
             camera: Its camera, of the photo's size.
-            keep: The user's own mask: pixels that are False are not read.
-            name: Its name where it is one of the scene's photos, shown whole: a method may have learnt an
-                embedding for it.
-            trust_mask: Whether pixels that the method takes for transient are left out too. Not for pictures that
-                are no photo of the place: there is nobody in the way, and everything is unusual.
-            explicit: Whether local appearance is read; False gives what the first stage of training has.
+            keep: The user's mask: False = ignore the pixel.
+            name: Name of the photo if it is a complete photo of the scene, for which there may be a learnt
+                embedding.
+            trust_mask: Whether pixels that the method predicts to be transient are ignored. Not useful for images
+                of other scenes, for which the prediction is meaningless.
+            explicit: Whether to compute the local appearance, which the first stage of training does not have.
         """
         return Appearance()
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
-        """M of a photo (RGB in [0, 1]) and nothing else of `encode`; None for a method without a mask."""
+        """The mask M of a photo (RGB in [0, 1]) without the rest of `encode`; None for a method without a mask."""
         return None
 
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
-        """Carries an appearance to the Gaussians; by default the global embedding is all there is.
+        """Converts an appearance to embeddings of the Gaussians; by default the global embedding only.
 
         Args:
             appearance: From `encode`.
@@ -177,15 +180,15 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """Spherical harmonics of the Gaussians under embeddings.
+        """Spherical harmonics of the Gaussians for embeddings.
 
         Args:
-            embeddings: From `embed` with the same `rows`, or a mix.
+            embeddings: From `embed` with the same `rows`, or a mix of several.
             rows: Indices of the Gaussians; None for all.
         """
 
     def shade(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """Spherical harmonics under an appearance: `embed`, then `fuse`."""
+        """Spherical harmonics for an appearance: `embed`, then `fuse`."""
         return self.fuse(self.embed(appearance, rows), rows)
 
     def mix(
@@ -198,15 +201,15 @@ class Method(nn.Module, ABC):
         return blend_embeddings(parts, weights, local_weights)
 
     def mean(self, parts: Iterable[Embeddings], count: int) -> Embeddings:
-        """The neutral light: by default the mean of `count` embeddings, read one at a time."""
+        """The neutral appearance: by default the mean of `count` embeddings, read one at a time."""
         return mean_embeddings(parts, count)
 
     def appearance_parameters(self) -> tuple[str, ...]:
-        """Prefixes of the tensors in `state_dict` that give embeddings their meaning; by default all."""
+        """Prefixes of the tensors in `state_dict` on which the meaning of embeddings depends; by default all."""
         return ("",)
 
     def fingerprint(self) -> str:
-        """Identifies the trained state to which saved embeddings belong: a digest of `appearance_parameters`."""
+        """A digest of `appearance_parameters`, which identifies the state for which saved embeddings are valid."""
         digest = hashlib.sha256()
         state = self.state_dict()
         for key in sorted(state):
@@ -218,14 +221,14 @@ class Method(nn.Module, ABC):
     def paint(
         self, projection: Projection, appearance: Appearance, sh_degree: int, *, clamped: bool = True
     ) -> Float[Tensor, "N 3"]:
-        """Colours of the Gaussians that a camera sees; zero for all others, which are not even shaded.
+        """Colours of the Gaussians that are visible in a camera; zero for all others, which are not shaded.
 
         Args:
-            projection: Of the camera.
-            appearance: The light.
+            projection: Projection to the camera.
+            appearance: The appearance.
             sh_degree: Evaluated degree of the harmonics.
-            clamped: Whether colours below black become black, as they are shown. What is to be changed is better
-                seen as it is: a change acts on the harmonics.
+            clamped: Whether negative colours are clamped, as for display. Fits of colour transforms need unclamped
+                colours, since the transforms are applied to harmonics.
         """
         rows = rows_to_shade(projection.visible)
         seen = self.paint_rows(rows, projection.camera, appearance, sh_degree, clamped=clamped)
@@ -240,7 +243,7 @@ class Method(nn.Module, ABC):
         *,
         clamped: bool = True,
     ) -> Float[Tensor, "V 3"]:
-        """As `paint`, of some Gaussians alone."""
+        """Like `paint`, but for and of the given Gaussians only."""
         means = take_rows(self.gaussians.means, rows)
         return sh_to_colors(means, self.shade(appearance, rows), camera, degree=sh_degree, clamped=clamped)
 
@@ -253,14 +256,14 @@ class Method(nn.Module, ABC):
         *,
         name: str | None = None,
     ) -> TrainingOutput:
-        """Renders a training photo under its own appearance, with gradients; by default under that of `encode`.
+        """Renders a training photo under its own appearance with gradients; by default under that of `encode`.
 
         Args:
             photo: RGB in [0, 1].
             camera: Its camera, of the photo's size.
-            stage: Of the training schedule.
-            keep: The user's own mask: pixels that are False are not read.
-            name: The photo's, by which a method may keep what it learnt or computed of it.
+            stage: Stage of the training schedule.
+            keep: The user's mask: False = ignore the pixel.
+            name: Name of the photo, by which a method may store or cache data for it.
         """
         projection = self.gaussians.project(camera, absgrad=stage.absgrad)
         projection.means2d.retain_grad()
@@ -276,12 +279,12 @@ class Method(nn.Module, ABC):
         sh_degree: int | None = None,
         depth: bool = True,
     ) -> Rendering:
-        """Rasterises the Gaussians under shaded harmonics: plain 3D Gaussian Splatting.
+        """Rasterises the Gaussians with given harmonics, as in plain 3DGS.
 
         Args:
-            camera: In the aligned frame; it is moved to the Gaussians' device.
+            camera: A camera in the aligned frame; it is moved to the Gaussians' device.
             sh: From `shade` or `fuse`.
-            background: Its colour; None is black.
+            background: Background colour; None is black.
             sh_degree: Evaluated degree of the harmonics; None takes all.
             depth: Whether the expected depth is rendered too.
         """

@@ -21,25 +21,25 @@ Packed = tuple[Tensor, Shapes]
 
 
 def pack(tensors: Sequence[Tensor]) -> Packed:
-    """Tensors of one dtype, flattened and joined, with their shapes."""
+    """Flattens and concatenates tensors of one dtype; returns the result and their shapes."""
     return torch.cat([tensor.flatten() for tensor in tensors]), tuple(tuple(t.shape) for t in tensors)
 
 
 def unpack(joined: Tensor, shapes: Shapes) -> list[Tensor]:
-    """The tensors that `pack` joined, as views."""
+    """The inverse of `pack`, as views."""
     parts = joined.split([math.prod(shape) for shape in shapes])
     return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 class FeatureCache:
-    """Keeps the features of the first photos that fit.
+    """Caches the features of the first photos that fit.
 
-    Photos train in shuffled rounds, in which dropping what was used longest ago would drop nearly everything just
-    before its turn.
+    A least-recently-used cache would evict most entries just before their next use, since photos are trained in
+    shuffled epochs.
 
     Attributes:
-        limit: Bytes.
-        num_bytes: Bytes of the features held now.
+        limit: Limit of the memory in bytes.
+        num_bytes: Memory in use, bytes.
     """
 
     def __init__(self, limit: int) -> None:
@@ -51,11 +51,11 @@ class FeatureCache:
         return len(self._kept)
 
     def get(self, key: Hashable) -> Packed | None:
-        """Features, or None where they were not kept."""
+        """The cached features, or None."""
         return self._kept.get(key)
 
     def put(self, key: Hashable, features: Packed) -> None:
-        """Keeps features if there is room for them."""
+        """Caches features if they fit."""
         size = features[0].nbytes
         if key not in self._kept and self.num_bytes + size <= self.limit:
             self._kept[key] = features
@@ -65,21 +65,21 @@ class FeatureCache:
 CALIBRATION_SIDE = 224
 SIDE_STEP = 32
 LEAST_SIDE = 64
-"""Of what the encoder reads. From 32 pixels its deepest map would be one wide, where oneDNN's convolution in
-bfloat16 (3 x 3, stride 2, hundreds of channels; torch 2.13) reads memory that nobody wrote: NaN, or worse."""
+"""Smallest side of the encoder's input. With 32 pixels its deepest map would be one pixel wide, for which oneDNN's
+bfloat16 convolution (3 x 3, stride 2, hundreds of channels; torch 2.13) reads uninitialised memory."""
 
 OPPONENTS = ((1 / 3, 1 / 3, 1 / 3), (0.5, -0.5, 0.0), (-0.25, -0.25, 0.5))
-"""Brightness, red against green, blue against yellow: so that a colour cast is not lost beside brightness."""
+"""Opponent colours: brightness, red-green and blue-yellow, so that a colour cast is separate from brightness."""
 
 STATISTICS = 2 * len(OPPONENTS)
 STATIC_BIAS = 2.0
-"""Logit of the mask before training: about 0.88, so that training begins with nearly everything static."""
+"""Initial logit of the mask (M = 0.88), so that nearly everything is static at first."""
 LOGIT_BOUND = 6.0
-"""Of the mask, so that it stays within 0.0025 and 0.9975: further out no gradient is left to bring it back."""
+"""Bound of the mask's logits, which keeps M within 0.0025 and 0.9975, where the sigmoid has a usable gradient."""
 
 
 class _Bounded(torch.autograd.Function):
-    """Clamps; gradients pass where they lead back inside, too."""
+    """Clamps logits, but passes gradients that point back inside the bounds."""
 
     @staticmethod
     def forward(ctx: Any, logits: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -97,14 +97,14 @@ class Parsing(MixedModule):
     """UNet on an encoder's features: Emb^g = M^G(AvgPooling(F)), M = sigmoid(decoder).
 
     Attributes:
-        feature_cache: Where features of a frozen encoder are kept in training; None computes them every time.
+        feature_cache: Cache for features of a frozen encoder in training; None computes them every time.
     """
 
     opponents: Tensor
     feature_cache: FeatureCache | None = None
 
     def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
-        """Takes the encoder that `config` names, unless another one is given."""
+        """Creates the network; `encoder` replaces the configured one."""
         super().__init__()
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
@@ -134,9 +134,9 @@ class Parsing(MixedModule):
 
         Args:
             photo: RGB in [0, 1].
-            learn_encoder: Whether gradients reach the encoder.
-            learn_mask: Whether gradients go through the mask.
-            name: By which features of a frozen encoder are kept; None keeps nothing.
+            learn_encoder: Whether the encoder gets gradients.
+            learn_mask: Whether gradients pass through the mask.
+            name: Key for caching features of a frozen encoder; None does not cache.
 
         Returns:
             The visibility mask M (1 = static, 0 = transient) and the global embedding Emb^g.
@@ -157,13 +157,13 @@ class Parsing(MixedModule):
     def _networks(
         self, image: Float[Tensor, "1 3 h w"], learn_encoder: bool, learn_mask: bool
     ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
-        """The mask's logits at a quarter of the resolution, and Emb^g."""
+        """The mask's logits at a quarter of the resolution, and Emb^g, with a trainable encoder."""
         with self.mixed(image.device), torch.set_grad_enabled(torch.is_grad_enabled() and learn_encoder):
             features = self.encoder(image)
         return self._decode(features, self._summary(image, features[-1]), learn_mask)
 
     def _frozen_features(self, photo: Float[Tensor, "H W 3"], name: str | None) -> Packed:
-        """A frozen encoder's features and the colour statistics of a photo, as one tensor, and their shapes."""
+        """A frozen encoder's features and the colour statistics of a photo, packed into one tensor."""
         assert isinstance(self.encoder, SqueezeNetEncoder)
         key = None if name is None else (name, *photo.shape[:2])
         found = None if key is None or self.feature_cache is None else self.feature_cache.get(key)
@@ -177,7 +177,7 @@ class Parsing(MixedModule):
     def _after_frozen(
         self, packed: Tensor, shapes: Shapes, learn_mask: bool
     ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
-        """As `_networks`, from `_frozen_features`."""
+        """Like `_networks`, from `_frozen_features`."""
         assert isinstance(self.encoder, SqueezeNetEncoder)
         *raw, statistics = unpack(packed, shapes)
         features = self.encoder.standardize(raw)
@@ -189,7 +189,7 @@ class Parsing(MixedModule):
     def _decode(
         self, features: Sequence[Tensor], summary: Float[Tensor, "1 S"], learn_mask: bool
     ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:
-        """The mask's logits at a quarter of the resolution, and Emb^g."""
+        """The mask's logits at a quarter of the resolution, and Emb^g, from the encoder's features."""
         x = features[-1]
         with self.mixed(x.device), torch.set_grad_enabled(torch.is_grad_enabled() and learn_mask):
             for block, skip in zip(self.decoder, features[-2:-5:-1], strict=True):
@@ -198,26 +198,26 @@ class Parsing(MixedModule):
         return coarse.float(), self.global_mlp(summary)[0]
 
     def _summary(self, images: Float[Tensor, "B 3 H W"], deepest: Tensor) -> Float[Tensor, "B S"]:
-        """What M^G reads: the average of the deepest features and, where configured, the colour statistics."""
+        """Input of M^G: the mean of the deepest features and, if configured, the colour statistics."""
         pooled = deepest.float().mean(dim=(2, 3))
         return (
             torch.cat([pooled, self._statistics(images)], dim=1) if self.config.color_statistics else pooled
         )
 
     def _statistics(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B T"]:
-        """Mean and spread of the photos' colours."""
+        """Mean and standard deviation of the photos' colours."""
         opponents = torch.einsum("oc, bchw -> bohw", self.opponents, images)
         spread, mean = torch.std_mean(opponents, dim=(2, 3), correction=0)
         return torch.cat([mean, spread], dim=1)
 
     @torch.no_grad()
     def calibrate(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
-        """Starts from what tells the photos apart.
+        """Initialises normalisation from photos of the collection.
 
-        The encoder gets its normalisation statistics (a pretrained ResNet keeps its own). The first layer of
-        M^G is set so that pooled features enter it around 0 and with a spread of 1 over the photos, and the last
-        so that Emb^g leaves it likewise: pooled features of different photos are nearly the same vector, and
-        without this many steps go by until the embedding says anything about the light.
+        Sets the encoder's normalisation statistics (a pretrained ResNet keeps its own). Scales the first layer of
+        M^G so that its input, and the last so that Emb^g, has mean 0 and variance 1 over the photos. Pooled
+        features of different photos are nearly the same vector, so that otherwise the embedding would stay
+        uninformative for many steps.
         """
         side = max(LEAST_SIDE, min(self.config.max_side, CALIBRATION_SIDE))
         squares = torch.cat(
@@ -235,17 +235,16 @@ class Parsing(MixedModule):
             deep = self.encoder.widths[-1]
             _standardize_input(first, summary, slice(0, deep))
             for each in range(deep, summary.shape[1]):
-                # These few are to tell as much as the many features: all enter with one variance.
+                # Scaled so that these few statistics have the same total variance as the many features.
                 first.weight[:, each].mul_((deep / STATISTICS) ** 0.5)
                 _standardize_input(first, summary, slice(each, each + 1))
             standardize_output(last, self.global_mlp(summary))
 
     def shrink(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
-        """The photo as a batch of one, at most `max_side` long, its sides multiples of `SIDE_STEP`.
+        """The photo as a batch of one, at most `max_side` long, with sides that are multiples of `SIDE_STEP`.
 
-        Photos of all sizes and shapes then come in a few: libraries prepare, and on CPUs compile, a convolution
-        for every new size, which took longer than computing it. Proportions change a little; the mask is carried
-        back to the photo's own.
+        This reduces the number of different sizes, because libraries prepare (on CPUs compile) a convolution for
+        every new size. The aspect ratio changes slightly; the mask is resized to that of the photo.
         """
         image = photo.permute(2, 0, 1)[None]
         factor = min(1.0, self.config.max_side / max(photo.shape[:2]))
@@ -260,18 +259,17 @@ class Parsing(MixedModule):
 
 
 def keep_features(module: nn.Module, cache: FeatureCache | None) -> None:
-    """Sets where 2D Parsing inside a module keeps what a frozen encoder gave; None keeps nothing."""
+    """Sets the feature cache of 2D Parsing inside a module; None disables it."""
     for part in module.modules():
         if isinstance(part, Parsing):
             part.feature_cache = cache
 
 
 def _standardize_input(layer: nn.Linear, samples: Float[Tensor, "B I"], part: slice) -> None:
-    """Makes a layer do with samples as they are what it would do with them around 0 and with spread 1 on average.
+    """Folds a standardisation of the inputs in `part` into a layer: mean 0, and variance 1 on average.
 
-    Of the inputs only `part` is touched. One factor for all of it: what differs little between photos is mostly
-    noise, and equal spread for every feature would let the layer learn single photos by heart. Photos that are
-    all alike leave it as it is.
+    All inputs share one factor, since features that vary little between photos are mostly noise, and amplifying
+    them would let the layer overfit single photos. Nothing changes if the samples are all the same.
     """
     samples = samples[:, part]
     mean = samples.mean(dim=0)

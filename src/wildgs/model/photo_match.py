@@ -1,6 +1,7 @@
-"""The colour match of a render with its photo: where the sky is, what the light codes are, and which pixels count.
+"""The colour match of a render with its photo: determines sky, light codes and valid pixels.
 
-`wildgs.model.color_match` has the least squares; `encode` keeps what is found, training compares with it.
+`wildgs.model.color_match` implements the least squares. `encode` stores the result in the appearance; training
+applies it to the render before the loss.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from wildgs.model.sky import Sky, find_sky
 from wildgs.rasterize import Projection, Rendering, blend, blend_sample
 
 MATCH_TILES, MATCH_EVERY = 40, 3
-"""Tiles of a training picture that are rendered for its match, and their rows and columns of which one is read."""
+"""In training, number of tiles that are rendered for the match, and stride of the pixels used in them."""
 FIT_SIDE = 320
-"""Pixels along the long side, at most, at which an encoded photo is matched: light is of low frequency."""
+"""Longest side, in pixels, at which an encoded photo is matched, since light is of low frequency."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A photo, and the Gaussians as its camera sees them.
+    """A photo, and the Gaussians projected to its camera.
 
     Attributes:
         photo: RGB in [0, 1].
-        projection: Into the photo's camera.
-        visibility: M; None where all of the photo is static.
-        keep: The user's own mask: pixels that are False do not count.
+        projection: Projection to the photo's camera.
+        visibility: M; None if the whole photo is static.
+        keep: The user's mask: False = ignore the pixel.
     """
 
     photo: Float[Tensor, "H W 3"]
@@ -56,7 +57,7 @@ class Sight:
         visibility: Float[Tensor, "H W"] | None,
         keep: Bool[Tensor, "H W"] | None,
     ) -> Sight:
-        """At `FIT_SIDE` pixels, at most."""
+        """Creates a `Sight` reduced to at most `FIT_SIDE` pixels."""
         scale = min(1.0, FIT_SIDE / max(photo.shape[:2]))
         height, width = (max(1, round(side * scale)) for side in photo.shape[:2])
         camera = camera.resized(width, height)
@@ -70,13 +71,13 @@ class Sight:
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendering with what its colours may be changed by.
+    """A rendering with light codes and sky mask.
 
     Attributes:
         rendering: Colours, depth and alpha.
-        codes: The light codes in its pixels.
-        sky: Which pixels show the sky; None for a scene without one.
-        pixels: Rows and columns of the photo that are there; None for all.
+        codes: Rendered light codes.
+        sky: Sky pixels; None for a scene without sky.
+        pixels: Rows and columns of the rendered pixels; None for all.
     """
 
     rendering: Rendering
@@ -86,18 +87,13 @@ class Picture:
 
 
 class PhotoMatch(nn.Module):
-    """Finds and applies changes of colours.
+    """Fits and applies colour transforms.
 
     Attributes:
-        codes: Gives every Gaussian its light codes, from its intrinsic feature; None for a match that has none.
+        codes: Linear layer from a Gaussian's intrinsic feature to its light codes; None without light codes.
     """
 
     def __init__(self, config: WildGSConfig) -> None:
-        """Sets up a `PhotoMatch`.
-
-        Args:
-            config: The method's.
-        """
         super().__init__()
         self.config = config
         self.codes = None
@@ -106,20 +102,20 @@ class PhotoMatch(nn.Module):
 
     @property
     def num_codes(self) -> int:
-        """Light codes of a Gaussian."""
+        """Number of light codes per Gaussian."""
         return 0 if self.codes is None else self.codes.out_features
 
     @property
     def columns(self) -> int:
-        """Columns of a change: [A | b] and the light codes' of the landmark, and the sky's."""
+        """Number of columns of a transform: [A | b] and light codes of the landmark, and those of the sky."""
         return 4 + self.num_codes + (SKY_COLUMNS if self.config.sky.points else 0)
 
     def light_codes(self, intrinsic: Float[Tensor, "N I"]) -> Float[Tensor, "N L"]:
-        """What the change of colours may depend on, from Gaussian to Gaussian."""
+        """Light codes of the Gaussians, by which their transforms vary."""
         return intrinsic[:, :0] if self.codes is None else self.codes(intrinsic)
 
     def sky(self, points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]) -> Sky | None:
-        """What is sky among points of a scene with this centre; None where there is none."""
+        """Which points of a scene with this centre are sky; None for a scene without sky."""
         return find_sky(self.config.sky, points.detach(), centre)
 
     @torch.no_grad()
@@ -131,13 +127,13 @@ class PhotoMatch(nn.Module):
         *,
         training: bool = False,
     ) -> Picture:
-        """Renders colours and light codes of the Gaussians, and finds the sky.
+        """Renders colours and light codes of the Gaussians, and determines the sky pixels.
 
         Args:
-            projection: Of the Gaussians.
-            values: Their colours and light codes, side by side.
-            centre: Of the scene.
-            training: Whether a sample of the pixels is enough.
+            projection: Projection of the Gaussians.
+            values: Their colours and light codes, concatenated.
+            centre: Centre of the scene.
+            training: Whether to render a sample of the pixels only.
         """
         if training:
             blended, pixels = blend_sample(projection, values, tiles=MATCH_TILES, every=MATCH_EVERY)
@@ -148,12 +144,12 @@ class PhotoMatch(nn.Module):
         return Picture(Rendering(colors, blended.depth, blended.alpha), codes, sky, pixels)
 
     def find(self, sight: Sight, picture: Picture, *, training: bool = False) -> Float[Tensor, "3 M"]:
-        """The change that takes the colours of a picture to those of the photo, without gradient.
+        """The colour transform from a rendering to the photo, without gradient.
 
         Args:
             sight: The photo.
-            picture: From its camera.
-            training: Whether each channel has a gain of its own; see `match_photo`.
+            picture: The rendering of its camera.
+            training: Whether to fit a gain per channel only; see `match_photo`.
         """
         pixels = (...,) if picture.pixels is None else picture.pixels
         return match_photo(
@@ -175,9 +171,9 @@ class PhotoMatch(nn.Module):
         intrinsic: Float[Tensor, "V I"],
         centre: Float[Tensor, " 3"],
     ) -> Float[Tensor, "V 3"]:
-        """Colours of Gaussians under a change found in training, in which channels do not mix.
+        """Applies a transform fitted in training, with a gain per channel, to colours of Gaussians.
 
-        Gradients flow to colours, intrinsic features and codes. `harmonics` does the same to harmonics.
+        Colours, intrinsic features and light codes get gradients. `harmonics` is the counterpart for harmonics.
         """
         own, by_code, of_sky, by_elevation = split_change(change, self.num_codes)
         gains, offsets = 1 + own[:, :3].diagonal(), own[:, 3].expand(len(colors), 3)
@@ -201,12 +197,12 @@ class PhotoMatch(nn.Module):
         intrinsic: Float[Tensor, "V I"],
         centre: Float[Tensor, " 3"],
     ) -> Float[Tensor, "V K 3"]:
-        """The harmonics of changed colours."""
+        """Applies a transform to spherical harmonics."""
         return changed_harmonics(harmonics, change, self.sky(means, centre), self.light_codes(intrinsic))
 
 
 def _resized(values: Float[Tensor, "H W *C"], height: int, width: int) -> Float[Tensor, "h w *C"]:
-    """A picture at another size, averaged."""
+    """Resizes an image with antialiasing."""
     if values.shape[:2] == (height, width):
         return values
     picture = values.reshape(*values.shape[:2], -1).permute(2, 0, 1)[None]

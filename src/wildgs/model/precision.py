@@ -1,4 +1,4 @@
-"""Mixed precision for the networks alone; geometry and rasterisation always run in float32."""
+"""Mixed precision of the networks; geometry and rasterisation always use float32."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wildgs.model.replays import Replays
 
 
 class MixedModule(nn.Module):
-    """A network whose forward pass may run in bfloat16, and be replayed as a CUDA graph."""
+    """A network whose forward pass may run in bfloat16 and be replayed as a CUDA graph."""
 
     precision: torch.dtype = torch.float32
 
@@ -24,8 +24,7 @@ class MixedModule(nn.Module):
         """Autocast to this module's precision."""
         enabled = self.precision != torch.float32
         dtype = self.precision if enabled else None
-        # Every weight is read once, so nothing is gained by keeping it; and graphs must not be recorded from what
-        # was kept.
+        # No weight cache: every weight is used once, and CUDA graphs must not capture cached copies.
         return torch.autocast(device.type, dtype=dtype, enabled=enabled, cache_enabled=False)
 
 
@@ -37,16 +36,16 @@ def set_precision(module: nn.Module, precision: torch.dtype) -> None:
 
 
 def switch_replays(module: nn.Module, on: bool) -> None:
-    """Whether the networks inside a module record and replay CUDA graphs where they run on CUDA."""
+    """Switches capturing and replaying of CUDA graphs on or off for all networks inside a module."""
     for part in module.modules():
         if isinstance(part, MixedModule):
             part.replays.switch(on)
 
 
 def lay_out_channels_last(module: nn.Module) -> None:
-    """Lays out the networks' convolutions channels-last: faster on CPUs and on tensor cores.
+    """Converts the networks to the channels-last memory format, which is faster on CPUs and tensor cores.
 
-    Call it before optimisers are made, whose state follows the parameters' layout.
+    Must be called before optimisers are created, whose state has the parameters' memory format.
     """
     for part in module.modules():
         if isinstance(part, MixedModule):
@@ -54,9 +53,9 @@ def lay_out_channels_last(module: nn.Module) -> None:
 
 
 def choose_precision(precision: Precision, device: torch.device) -> torch.dtype:
-    """The dtype of a configured precision: 'auto' is bfloat16 where the hardware multiplies it fast.
+    """The dtype of a configured precision: 'auto' is bfloat16 on hardware that accelerates it.
 
-    On CPUs that is AVX-512 BF16 or AMX, on NVIDIA GPUs Ampere or newer; elsewhere bfloat16 is emulated and slower
+    That is CPUs with AVX-512 BF16 or AMX, and NVIDIA GPUs from Ampere on; elsewhere bfloat16 is emulated and slower
     than float32.
     """
     if precision != "auto":

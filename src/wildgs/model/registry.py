@@ -1,6 +1,6 @@
-"""Methods by name. A new method is a file of its own and one line here.
+"""Registry of methods. A new method is a separate file and one line here.
 
-Classes are imported when they are first asked for, so that the command line can list methods without torch.
+Classes are imported at their first use, so that the command line can list methods without importing torch.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Registered:
-    """Where a method is, as ``module:name`` within this package.
+    """Location of a method, as ``module:name``.
 
     Attributes:
         method: The class.
-        config: Its configuration, where that can be imported without torch; None takes the class's own.
+        config: Its configuration, if it can be imported without torch; None uses `Method.Config`.
     """
 
     method: str
@@ -59,7 +59,7 @@ def method_type(name: MethodName) -> type[Method]:
     """The class of a method.
 
     Raises:
-        UserError: There is no such method.
+        UserError: The method is unknown.
     """
     return _find(_registered(name).method)
 
@@ -68,7 +68,7 @@ def config_type(name: MethodName) -> type:
     """The dataclass of a method's options.
 
     Raises:
-        UserError: There is no such method.
+        UserError: The method is unknown.
     """
     place = _registered(name).config
     return method_type(name).Config if place is None else _find(place)
@@ -77,14 +77,14 @@ def config_type(name: MethodName) -> type:
 def create_method(
     name: MethodName, config: Any, scene: Scene, *, max_gaussians: int = 3_000_000, seed: int = 0
 ) -> Method:
-    """A method at its start.
+    """Creates an untrained method.
 
     Args:
-        name: Which method.
+        name: Name of the method.
         config: Its configuration; None for the defaults.
-        scene: Where its first Gaussians come from.
-        max_gaussians: Bound on their number.
-        seed: Of random choices among points.
+        scene: The scene, from which initial Gaussians are created.
+        max_gaussians: Upper bound on their number.
+        seed: Random seed of the selection of points.
     """
     from wildgs.model.initial import initial_gaussians
 
@@ -94,7 +94,7 @@ def create_method(
 
 
 def restore_method(name: MethodName, config: Any, state: dict[str, Tensor]) -> Method:
-    """A method as `Method.state_dict` described it; reads no pretrained weights.
+    """Restores a method from `Method.state_dict`, without reading pretrained weights.
 
     Raises:
         UserError: The tensors do not belong to this method and configuration.
@@ -113,7 +113,7 @@ def restore_method(name: MethodName, config: Any, state: dict[str, Tensor]) -> M
 
 
 def _check_rows(rows: dict[str, Tensor], shapes: dict[str, tuple[int, ...]]) -> None:
-    """Checks that all rows are there, each with its shape and all with one length.
+    """Checks names and shapes of all rows.
 
     Raises:
         KeyError: A row is missing.
@@ -122,4 +122,4 @@ def _check_rows(rows: dict[str, Tensor], shapes: dict[str, tuple[int, ...]]) -> 
     count = rows["means"].shape[0]
     for row, shape in shapes.items():
         if rows[row].shape != (count, *shape):
-            raise RuntimeError(f"{row} is {tuple(rows[row].shape)} where {(count, *shape)} is needed")
+            raise RuntimeError(f"{row} has shape {tuple(rows[row].shape)} instead of {(count, *shape)}")

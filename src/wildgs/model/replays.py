@@ -1,10 +1,10 @@
-"""CUDA graphs for networks whose inputs come in a few shapes: hundreds of small kernels, launched as one.
+"""CUDA graphs for networks whose inputs have few different shapes.
 
-Parsing and the triplane's UNet take hundreds of kernels each way that run for microseconds; to launch them one by
-one takes the host longer than the device takes for the whole picture. Forward and backward pass are captured for
-every shape that comes up again, as `torch.cuda.make_graphed_callables` does, with three differences: parameters are
-captured through aliases, so that no gradient accumulator of an eager step takes part; other threads may use CUDA
-meanwhile; and gradients are written by one autograd function instead of one accumulator a parameter.
+Parsing and the triplane's UNet launch hundreds of kernels of a few microseconds in each pass, and launching them
+takes the host longer than the device needs for the whole image. Forward and backward pass are captured for every
+recurring shape, as by `torch.cuda.make_graphed_callables`, with three differences: parameters are captured through
+aliases, so that gradient accumulators of eager steps are not involved; other threads may use CUDA during the
+capture; and gradients are written by one autograd function instead of one accumulator per parameter.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from wildgs import features
 from wildgs.errors import WildGSWarning
 
 EAGER_CALLS = 2
-"""Calls of one shape before it is recorded: a shape that comes once is not worth it."""
+"""Number of eager calls of a shape before it is captured."""
 MOST_GRAPHS = 32
-"""Further ones run without. Parsing has 13 shapes at most (`Parsing.shrink`), each of them with and without a mask
-that learns; a ResNet encoder learns on the same steps as the mask does."""
+"""Upper bound on the number of graphs; further shapes run eagerly. Parsing has at most 13 shapes
+(`Parsing.shrink`), each with and without training of the mask; a ResNet encoder is trained on the same steps as the
+mask."""
 WARM_UP = 3
-"""Passes before the capture, in which libraries choose their kernels and allocate their workspaces."""
+"""Passes before the capture, in which libraries choose kernels and allocate workspaces."""
 TOLERANCE = 0.05
-"""Relative difference up to which a graph is accepted, in the Euclidean norm over all outputs, and over all
-gradients: two runs in bfloat16, and kernels that libraries choose differently while recording. Single small tensors
-may differ by more: gradients that are summed with atomics do from one eager run to the next."""
+"""Largest relative difference between a graph and eager execution, in the Euclidean norm over all outputs and over
+all gradients. Differences are due to bfloat16, to kernels that libraries choose differently during capture, and to
+gradients summed by atomics, which also differ between eager runs."""
 
 Outputs = tuple[Tensor, ...]
 Network = Callable[..., Outputs]
@@ -39,13 +40,13 @@ Result = TypeVar("Result")
 
 
 class Replays:
-    """Calls a network, or replays what was recorded of it.
+    """Calls a network, or replays a captured graph of it.
 
-    All of one network's graphs share their memory. What a replay gives, gradients included, is to be used up before
-    the next one, of whatever shape.
+    All graphs of a network share their memory: results of a replay, including gradients, must be used before the
+    next replay of any shape.
 
     Attributes:
-        on: Whether to record at all. Only calls on CUDA that record gradients ever are.
+        on: Whether to capture graphs; only calls on CUDA with gradients are captured.
     """
 
     def __init__(self) -> None:
@@ -55,25 +56,25 @@ class Replays:
         self._memory: Any = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Replays:
-        """A copy of a network has parameters of its own, of which nothing is recorded yet."""
+        """A copy without graphs, since a copied network has other parameters."""
         copy = Replays()
         copy.on = self.on
         return copy
 
     @property
     def recorded(self) -> int:
-        """How many graphs there are."""
+        """Number of captured graphs."""
         return len(self._graphs)
 
     def switch(self, on: bool) -> None:
-        """Turns recording on or off, and forgets what was recorded."""
+        """Turns capturing on or off and discards all graphs."""
         self.on = on
         self._calls.clear()
         self._graphs.clear()
         self._memory = None
 
     def records(self, x: Tensor) -> bool:
-        """Whether networks are recorded that take `x`."""
+        """Whether calls with the input `x` are captured."""
         return self.on and x.is_cuda and torch.is_grad_enabled()
 
     def __call__(
@@ -82,11 +83,11 @@ class Replays:
         """``network(x, *settings)``.
 
         Args:
-            network: From one tensor to several. Launches the same kernels whenever shape and settings are the same,
-                waits for nothing, draws nothing at random.
-            modules: Those that it calls.
-            x: Takes no gradient.
-            settings: Further arguments; each combination is recorded by itself.
+            network: Function of one tensor that returns several. It must launch the same kernels for the same shape
+                and settings, must not synchronise, and must not use random numbers.
+            modules: The modules that it calls.
+            x: Input without gradient.
+            settings: Further arguments; each combination is captured separately.
         """
         if not self.records(x):
             return network(x, *settings)
@@ -103,7 +104,7 @@ class Replays:
             self.switch(False)
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             warnings.warn(
-                f"CUDA graphs cannot be used here ({reason}); training continues without, a little slower",
+                f"CUDA graphs do not work here ({reason}); training continues without them, a little slower",
                 WildGSWarning,
                 stacklevel=2,
             )
@@ -112,7 +113,7 @@ class Replays:
 
 
 class _Part(nn.Module):
-    """What is recorded: a function of one tensor, and the modules whose parameters get gradients by it."""
+    """The function to capture, and the modules whose parameters get gradients by it."""
 
     def __init__(self, network: Network, modules: Iterable[nn.Module], settings: Sequence[Any]) -> None:
         super().__init__()
@@ -125,28 +126,28 @@ class _Part(nn.Module):
 
 
 class Recording:
-    """The forward and the backward pass of a network at one shape, as two CUDA graphs.
+    """The forward and the backward pass of a network for one shape, as two CUDA graphs.
 
     Attributes:
         learnt: Parameters that get gradients.
-        gradients: Theirs, in the graphs' memory, in the parameters' memory layout; None for what takes no part.
+        gradients: Their gradients, in the graphs' memory and the parameters' memory format; None for unused ones.
     """
 
     def __init__(self, part: _Part, x: Tensor, memory: Any) -> None:
-        """Records a network.
+        """Captures a network.
 
         Args:
             part: The network.
-            x: Of the shape to record.
-            memory: The pool from which both graphs take theirs.
+            x: Input of the shape to capture.
+            memory: Memory pool of both graphs.
 
         Raises:
-            RuntimeError: It cannot be recorded.
+            RuntimeError: The network cannot be captured.
         """
         named = {name: p for name, p in part.named_parameters() if p.requires_grad}
         self.learnt = list(named.values())
-        # Leaves of their own that share the parameters' memory: the parameters' gradient accumulators may belong to
-        # an eager step and to its stream, which would invalidate the capture.
+        # Separate leaves that share the parameters' memory, because the parameters' gradient accumulators may
+        # belong to an eager step and its stream, which would invalidate the capture.
         aliases = {name: parameter.detach().requires_grad_() for name, parameter in named.items()}
         self._x = x.clone()
         self._anchor = torch.zeros((), device=x.device, requires_grad=True)
@@ -168,7 +169,7 @@ class Recording:
                 outputs = forward()
                 self._incoming = [torch.zeros_like(output) for output in outputs if output.requires_grad]
                 backward()
-        # Recording that fails may leave its stream the current one.
+        # Restores the current stream if the capture fails.
         with torch.cuda.stream(torch.cuda.current_stream()):
             self._forward, outputs = _captured(forward, memory)
             self._backward, self.gradients = _captured(backward, memory)
@@ -176,7 +177,7 @@ class Recording:
         self._learning = [output.requires_grad for output in outputs]
 
     def __call__(self, x: Tensor) -> Outputs:
-        """What the network gives for `x`."""
+        """Replays the network for `x`."""
         if features.is_on("written_gradients"):
             return _Replay.apply(self, x, self._anchor)
         return _Replay.apply(self, x, *self.learnt)
@@ -191,21 +192,21 @@ class Recording:
         """Computes `gradients`."""
         for parameter, gradient in zip(self.learnt, self.gradients, strict=True):
             if gradient is not None and parameter.grad is gradient:
-                parameter.grad = gradient.clone()  # of a replay before, to which this one's will be added
+                parameter.grad = gradient.clone()  # of the previous replay, to which this one's will be added
         wanted = [gradient for gradient, learns in zip(incoming, self._learning, strict=True) if learns]
         for place, gradient in zip(self._incoming, wanted, strict=True):
             place.copy_(gradient)
         self._backward.replay()
 
     def write_gradients(self) -> None:
-        """Gives every parameter its gradient, as its accumulator would."""
+        """Sets or adds to every parameter's gradient, as its accumulator would."""
         for parameter, gradient in zip(self.learnt, self.gradients, strict=True):
             if gradient is not None:
                 parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
 
 
 class _Replay(torch.autograd.Function):
-    """One replay each way. Its differentiable input is the parameters, or one number that stands for them."""
+    """One replay of each pass. Its differentiable inputs are the parameters, or one scalar in their place."""
 
     @staticmethod
     def forward(ctx: Any, recording: Recording, x: Tensor, *inputs: Tensor) -> Outputs:
@@ -224,7 +225,7 @@ class _Replay(torch.autograd.Function):
         if ctx.writes:
             recording.write_gradients()
             return None, None, None
-        # Copies: an accumulator would keep the graph's own memory, which the next replay overwrites.
+        # Cloned, because an accumulator would store the graph's memory, which the next replay overwrites.
         return (
             None,
             None,
@@ -233,9 +234,9 @@ class _Replay(torch.autograd.Function):
 
 
 def _captured(function: Callable[[], Result], memory: Any) -> tuple[Any, Result]:
-    """A CUDA graph of what a function launches, and what it returned.
+    """Captures a function; returns the CUDA graph and the function's result.
 
-    Threads that decode photos or write checkpoints go on meanwhile; their calls must not invalidate the capture.
+    Calls by other threads, which decode photos or write checkpoints, do not invalidate the capture.
     """
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, pool=memory, capture_error_mode="thread_local"):
@@ -244,7 +245,7 @@ def _captured(function: Callable[[], Result], memory: Any) -> tuple[Any, Result]
 
 
 def _laid_out_as(parameter: Tensor, gradient: Tensor) -> Tensor:
-    """A gradient in its parameter's memory layout, which fused Adam asks for."""
+    """Converts a gradient to its parameter's memory format, as fused Adam requires."""
     strides = zip(parameter.shape, parameter.stride(), gradient.stride(), strict=True)
     if all(one == other for size, one, other in strides if size > 1):
         return gradient
@@ -252,23 +253,23 @@ def _laid_out_as(parameter: Tensor, gradient: Tensor) -> Tensor:
 
 
 def _record(part: _Part, x: Tensor, memory: Any) -> Recording:
-    """A recording of the part at this shape, compared with the part itself once.
+    """Captures a part for a shape and compares it with eager execution.
 
     Raises:
-        RuntimeError: It cannot be recorded, or gives other numbers.
+        RuntimeError: The part cannot be captured, or its results differ.
     """
     recording = Recording(part, x, memory)
     wanted = _values_and_gradients(part, x, recording.learnt)
     found = _values_and_gradients(recording, x, recording.learnt)
     if not all(_alike(one, other) for one, other in zip(wanted, found, strict=True)):
-        raise RuntimeError("a replay gives other numbers")
+        raise RuntimeError("results of a replay differ from eager execution")
     return recording
 
 
 def _values_and_gradients(
     part: Callable[[Tensor], Outputs], x: Tensor, learnt: Sequence[nn.Parameter]
 ) -> tuple[Values, Values]:
-    """Copies of what comes out, and of the parameters' gradients by it; the parameters keep those that they had."""
+    """Copies of the outputs and of the parameters' gradients; restores the parameters' previous gradients."""
     before = [parameter.grad for parameter in learnt]
     for parameter in learnt:
         parameter.grad = None
@@ -284,7 +285,7 @@ def _values_and_gradients(
 
 
 def _alike(wanted: Values, found: Values) -> bool:
-    """Whether the same values are None, and the others differ little in their joint norm."""
+    """Whether the same values are None and the others agree up to `TOLERANCE` in their joint norm."""
     if [value is None for value in wanted] != [value is None for value in found]:
         return False
     ones, others = ([value for value in values if value is not None] for values in (wanted, found))

@@ -1,7 +1,7 @@
-"""CPU kernels that sample three planes at points and scatter gradients back.
+"""CPU kernels that sample three planes at points, and scatter gradients to the planes.
 
-torch's grid_sample is as fast forward but about six times slower backward on two cores: its scatter into
-channel-first planes touches one cache line a channel. Here a cell's channels lie side by side.
+The forward pass of torch's grid_sample is as fast, but its backward pass is about six times slower on two cores,
+because it scatters into channel-first planes, one cache line per channel. Here a cell's channels are contiguous.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from wildgs.kernel_cache import njit
 from wildgs.threads import fetch_add
 
 BANDS = 8
-"""Row bands a plane, each scattered by one thread alone: no atomics, and the same sums for any thread count."""
+"""Row bands per plane, each processed by one thread: no atomics, and the same sums for any number of threads."""
 
 
 @njit(nogil=True, fastmath=True, error_model="numpy", inline="always")

@@ -1,7 +1,7 @@
-"""The sky: a far shell of Gaussians, since photos are full of sky and structure from motion finds no point in it.
+"""The sky: initial Gaussians on a large sphere, since structure from motion finds no points in the sky.
 
-Not in the paper. Without it, sky is built of what densification can reach, which is floaters right before single
-cameras. Others have done the same: Kulhanek et al. 2024 (WildGaussians) place points on a sphere for it.
+Not in the paper. Without them, densification represents the sky by floaters in front of single cameras. Kulhanek et
+al. (WildGaussians, 2024) place points on a sphere, too.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ COLOR = 0.75
 
 @dataclass(frozen=True)
 class Sky:
-    """What is sky among points of the scene.
+    """Sky mask and elevation of points.
 
     Attributes:
-        which: Which points are.
-        sine: Of every point's elevation, seen from the scene's centre.
+        which: Mask of the points that belong to the sky.
+        sine: Sine of every point's elevation, seen from the scene's centre.
     """
 
     which: Bool[Tensor, "*batch"]
@@ -33,12 +33,12 @@ class Sky:
 
 
 def find_sky(config: SkyConfig, points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]) -> Sky | None:
-    """Tells the sky from the scene: it is further away than half of the shell's radius.
+    """Separates sky from scene: points farther than half of the sphere's radius are sky.
 
     Args:
-        config: The shell; without points there is no sky.
-        points: In the aligned frame.
-        centre: Of the scene.
+        config: Configuration of the sphere; None is returned if it has no points.
+        points: Points in the aligned frame.
+        centre: Centre of the scene.
     """
     if not config.points:
         return None
@@ -51,8 +51,8 @@ def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor,
     """Centres of the sky's Gaussians.
 
     Args:
-        config: The shell.
-        points: The scene's SfM points in the aligned frame, +z up.
+        config: Configuration of the sphere.
+        points: SfM points in the aligned frame.
     """
     centre = points.median(dim=0).values
     distances = (points - centre).norm(dim=1).sort().values
@@ -62,11 +62,11 @@ def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor,
 
 
 def shell_directions(count: int, lowest: float) -> Float[Tensor, "count 3"]:
-    """Unit vectors spread evenly over all directions above an elevation (a Fibonacci lattice), +z up.
+    """Unit vectors distributed evenly over all directions above an elevation (a Fibonacci lattice).
 
     Args:
-        count: How many.
-        lowest: Least elevation, degrees.
+        count: Number of vectors.
+        lowest: Lowest elevation, degrees.
     """
     index = torch.arange(count, dtype=torch.float64)
     low = math.sin(math.radians(lowest))

@@ -1,7 +1,7 @@
 """SqueezeNet 1.1 (Iandola et al. 2016) with the weights that ship with the package.
 
-One file holds torchvision's ImageNet weights of the convolutions and LPIPS's linear layers, both in half precision:
-the default encoder of 2D Parsing reads photos with it, and LPIPS compares pictures with it.
+One file contains torchvision's ImageNet weights of the convolutions and the linear layers of LPIPS, in half
+precision. The default encoder of 2D Parsing and LPIPS use them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LPIPS_WIDTHS = (64, 128, 256, 384, 384, 512, 512)
 
 
 class Fire(nn.Module):
-    """SqueezeNet's module; parameters are named as torchvision's, so that its weights load."""
+    """SqueezeNet's Fire module, with torchvision's parameter names, so that its weights can be loaded."""
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()
@@ -32,13 +32,13 @@ class Fire(nn.Module):
         self.expand3x3 = nn.Conv2d(squeezed, expanded, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
-        """Features at the same resolution, after the rectifier."""
+        """Features at the same resolution, after the ReLU."""
         x = functional.relu(self.squeeze(x))
         return torch.cat([functional.relu(self.expand1x1(x)), functional.relu(self.expand3x3(x))], dim=1)
 
 
 def squeezenet_layers() -> nn.Sequential:
-    """The convolutional part, untrained, with its layers at torchvision's positions."""
+    """The untrained convolutional layers, at torchvision's positions."""
     return nn.Sequential(
         nn.Conv2d(3, 64, 3, stride=2),
         nn.ReLU(),
@@ -58,7 +58,7 @@ def squeezenet_layers() -> nn.Sequential:
 
 @cache
 def packaged_weights() -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The convolutions' and LPIPS's linear weights in float32, named as torchvision and LPIPS name them."""
+    """Weights of the convolutions (torchvision's names) and of LPIPS's linear layers (its names) in float32."""
     data = (resources.files("wildgs") / "weights" / WEIGHTS_FILE).read_bytes()
     tensors = {name: value.float() for name, value in load(data).items()}
     prefix = "features."

@@ -1,4 +1,4 @@
-"""What training and a method hand each other."""
+"""Data exchanged between the trainer and a method."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from wildgs.rasterize import Projection, Rendering
 
 @dataclass(frozen=True)
 class Stage:
-    """The state of the training schedule that a method's forward pass depends on.
+    """State of the training schedule for a method's forward pass.
 
     Attributes:
-        explicit: Whether local appearance (the triplane) is on: off in the paper's first stage.
-        learn_mask: Whether the visibility mask takes gradients now.
+        explicit: Whether local appearance (the triplane) is on; off in the first stage.
+        learn_mask: Whether the visibility mask gets gradients.
         sh_degree: Active degree of the spherical harmonics.
-        learn_encoder: Whether the photo's encoder takes gradients now.
-        learn_planes: Whether the triplane's UNet takes gradients now.
-        dropout: Share of the Gaussians that is left out now (see `wildgs.model.dropout`).
-        neighbours: Gaussians that are left out together.
-        absgrad: Whether absolute screen gradients are collected.
+        learn_encoder: Whether the image encoder gets gradients.
+        learn_planes: Whether the triplane's UNet gets gradients.
+        dropout: Dropout rate of Gaussians (see `wildgs.model.dropout`).
+        neighbours: Number of neighbouring Gaussians that are dropped together.
+        absgrad: Whether absolute view-space gradients are collected.
     """
 
     explicit: bool = True
@@ -39,12 +39,12 @@ class Stage:
 
 @dataclass(frozen=True)
 class TrainingOutput:
-    """One training view's forward pass.
+    """Result of a method's forward pass for one training photo.
 
     Attributes:
         rendering: Colours, expected depth and alpha.
-        projection: Its screen statistics feed densification.
-        visibility: M, or None for a method without a mask.
+        projection: Projection of the Gaussians, whose statistics densification uses.
+        visibility: M; None for a method without a mask.
     """
 
     rendering: Rendering
@@ -57,8 +57,8 @@ class ParameterGroup:
     """Network parameters that share a learning rate.
 
     Attributes:
-        name: Unique among the groups of a method.
-        parameters: Not rows of the Gaussians: those have `Method.row_rates`.
+        name: Name, unique among the groups of a method.
+        parameters: The parameters; no per-Gaussian ones, which have `Method.row_rates`.
         rate: Their learning rate.
     """
 
@@ -69,13 +69,13 @@ class ParameterGroup:
 
 @dataclass(frozen=True)
 class SeenPhoto:
-    """A training photo, as `Method.finish` gets it.
+    """A training photo for `Method.finish`.
 
     Attributes:
         photo: RGB in [0, 1].
         camera: Its camera, of the photo's size.
-        keep: The user's own mask: pixels that are False are not read.
-        name: The photo's.
+        keep: The user's mask: False = ignore the pixel.
+        name: Name of the photo.
     """
 
     photo: Float[Tensor, "H W 3"]

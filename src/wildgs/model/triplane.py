@@ -1,7 +1,7 @@
-"""The triplane: six orthographic pictures of a coloured cloud in, features at any point out.
+"""The triplane: orthographic projections of a coloured point cloud, and sampling of feature planes at points.
 
-Planes are XY, YZ and ZX of the scene's aligned frame, in this order everywhere. On plane (a, b) the column of
-a cell follows axis a and the row follows axis b; the third axis is the one along which the plane looks.
+Planes are XY, YZ and ZX of the aligned frame, in this order everywhere. On plane (a, b) the column of a cell
+follows axis a and the row follows axis b; the projection is along the third axis.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from wildgs.threads import launch
 PLANE_AXES = ((0, 1), (1, 2), (2, 0))
 VIEW_AXIS = (2, 0, 1)
 PICTURE_CHANNELS = 4
-"""Red, green, blue, validity."""
+"""Channels: red, green, blue, validity."""
 POINTS_PER_ITEM = 1024
 REJECTED_CELLS = 4096
 
@@ -39,7 +39,7 @@ class Box:
     high: Float[Tensor, "3"]
 
     def normalize(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Coordinates in [-1, 1] inside the box: the paper's P̃."""
+        """Coordinates normalised to [-1, 1] inside the box: the paper's P̃."""
         return (points - self.low) / (self.high - self.low) * 2 - 1
 
     def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, "N"]:
@@ -48,12 +48,12 @@ class Box:
 
 
 def robust_box(points: Float[Tensor, "P 3"], quantile: float, ratio: float) -> Box:
-    """The box that holds most points, shrunk towards their median (paper, Efficient Triplane Sampling).
+    """The bounding box of most points, scaled about their median (paper, Efficient Triplane Sampling).
 
     Args:
-        points: Sparse SfM points; far outliers are normal.
-        quantile: Share of points left out on each side of each axis.
-        ratio: Crop ratio: 1 keeps the whole box, 0.5 half of its sides.
+        points: SfM points, possibly with distant outliers.
+        quantile: Fraction of points outside the box at each end of each axis.
+        ratio: Crop ratio, the factor on the box's sides.
     """
     ordered = points.sort(dim=0).values
     last = len(points) - 1
@@ -72,26 +72,26 @@ def project_cloud(
     resolution: int,
     keep: Bool[Tensor, " P"] | None = None,
 ) -> Float[Tensor, "3 2 4 R R"]:
-    """Orthographic pictures of a coloured cloud: c and c' on XY, YZ and ZX (paper, Triplane Color Creation).
+    """Orthographic projections of a coloured cloud: c and c' on XY, YZ and ZX (paper, Triplane Color Creation).
 
-    Of the points that fall into one cell, the one nearest to the viewer wins. Both directions of a plane share
-    the grid (the reverse is not mirrored), so that a cell means the same line in space in c and in c'.
+    Each cell gets the colour of the point nearest to the viewer. Both directions of a plane share the grid (c' is
+    not mirrored), so that a cell stands for the same line in space in c and c'.
 
     Args:
-        points: Normalised positions; those outside [-1, 1] are left out.
+        points: Normalised positions; those outside [-1, 1] are ignored.
         colors: RGB in [0, 1].
         resolution: Cells per side, R.
-        keep: Which points count; None for all.
+        keep: Mask of the points to use; None for all.
 
     Returns:
-        Per plane: the picture seen from the positive end of the third axis (c), then from the negative end (c').
+        For each plane, the image seen from the positive end of the third axis (c), then from the negative end (c').
         Channels are red, green, blue, validity; empty cells are zero.
     """
     inside = (points.abs() <= 1).all(dim=-1)
     if keep is not None:
         inside = inside & keep
     if points.device.type == "cpu":
-        # Elsewhere the host would wait to learn how many they are.
+        # On a GPU, selecting points would synchronise.
         points, colors, inside = points[inside], colors[inside], inside[inside]
     if len(points) == 0:
         return colors.new_zeros(3, 2, PICTURE_CHANNELS, resolution, resolution)
@@ -104,20 +104,16 @@ def project_cloud(
 def _nearest_per_cell(
     points: Float[Tensor, "P 3"], inside: Bool[Tensor, " P"], resolution: int
 ) -> tuple[Int[Tensor, " M"], Bool[Tensor, " M"]]:
-    """For all cells of all six pictures the index of the nearest point, and whether there is one.
-
-    Ties go to the first point.
-    """
+    """For each cell of all six images: the index of the nearest point, and whether there is one."""
     count = resolution * resolution
     cells = ((points.T + 1) * (0.5 * resolution)).long().clamp_(0, resolution - 1)
     heights = torch.stack([points[:, axis] for axis in VIEW_AXIS])
     columns, rows = (torch.stack([cells[axes[i]] for axes in PLANE_AXES]) for i in (0, 1))
     index = torch.arange(points.shape[0], device=points.device)
-    # Points that do not count have cells of their own behind the others. Were it a single one, all of them would
-    # wait for each other's atomic minimum there.
+    # Ignored points get additional cells at the end, several of them to avoid contention of atomics.
     spread = REJECTED_CELLS if features.is_on("spread_rejected") else 1
     cell = torch.where(inside, rows * resolution + columns, count + index % spread)[:, None].expand(-1, 2, -1)
-    # One integer that orders by distance first and by index second makes scatter-min yield the winner itself.
+    # Distance in the upper and index in the lower bits, so that scatter-min gives the index of the nearest point.
     distance = torch.stack([1 - heights, 1 + heights], dim=1)
     ordinal = (distance * (2**30 - 1)).long().clamp_(0, 2**31 - 2)
     key = (ordinal << 32) | index
@@ -129,20 +125,20 @@ def _nearest_per_cell(
 
 
 def sample_planes(planes: Float[Tensor, "3 C R R"], points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
-    """f_xy + f_yz + f_zx: bilinear samples of the three planes at points, summed.
+    """f_xy + f_yz + f_zx: the sum of bilinear samples of the three planes at points.
 
-    Differentiable in the planes; the points take no gradient.
+    Differentiable in the planes; the points get no gradient.
 
     Args:
         planes: Feature maps of XY, YZ and ZX.
-        points: Normalised positions in [-1, 1]; cell centres lie at (2 i + 1) / R - 1, and beyond the outermost
-            centres the border is repeated.
+        points: Normalised positions in [-1, 1]; cell centres are at (2 i + 1) / R - 1, and the border is repeated
+            beyond the outermost centres.
     """
     if planes.device.type == "cpu" and planes.dtype == torch.float32:
         return _SampleOnCPU.apply(planes, points)
     if planes.is_cuda and planes.dtype == torch.float32 and _has_triton(planes, points):
         return _triton(planes, points)
-    x, y, z = points.detach().unbind(1)  # no index lists: each would be carried to a GPU, which is waited for
+    x, y, z = points.detach().unbind(1)  # indexing by lists would synchronise with a GPU
     grid = torch.stack([x, y, y, z, z, x], dim=1).reshape(-1, 3, 2).permute(1, 0, 2)
     sampled = functional.grid_sample(
         planes, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False

@@ -1,7 +1,7 @@
-"""Triton kernels that sample three planes at points and scatter gradients back, channels last.
+"""Triton kernels that sample three planes at points, and scatter gradients to the planes, channels last.
 
-grid_sample's gradient adds 384 numbers a point (3 planes, 4 corners, 32 channels) into channel-first planes, each
-to an address of its own; here the channels of a cell are one line of memory, read and added to together.
+The gradient of grid_sample adds 384 numbers per point (3 planes, 4 corners, 32 channels) to channel-first planes,
+each at a different address; here the channels of a cell are contiguous.
 """
 
 # pyright: reportMissingImports=false, reportIndexIssue=false
@@ -16,7 +16,7 @@ import triton.language as tl
 from torch import Tensor
 
 POINTS = 32
-"""Points a program works on."""
+"""Points per program."""
 
 
 @triton.jit
@@ -53,7 +53,7 @@ def _sample(planes, points, out, count, resolution, channels, POINTS: tl.constex
 
 @triton.jit
 def _scatter(gradient, points, out, count, resolution, channels, POINTS: tl.constexpr, WIDTH: tl.constexpr):
-    """Adds the gradient of `_sample` by its planes into `out` [3, R, R, C]; one program a block and plane."""
+    """Adds the gradient of `_sample` by its planes to `out` [3, R, R, C]; one program per block and plane."""
     n = tl.program_id(0) * POINTS + tl.arange(0, POINTS)
     plane = tl.program_id(1)
     c = tl.arange(0, WIDTH)
@@ -78,7 +78,7 @@ class TritonSample(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, planes: Tensor, points: Tensor) -> Tensor:
-        """Planes [3, C, R, R] and points [N, 3] to [N, C]."""
+        """Computes [N, C] from planes [3, C, R, R] and points [N, 3]."""
         cells = planes.permute(0, 2, 3, 1).contiguous()
         points = points.contiguous()
         resolution, channels = cells.shape[1], cells.shape[3]
@@ -93,7 +93,7 @@ class TritonSample(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        """The planes' gradient; points take none."""
+        """The gradient of the planes; points get none."""
         (points,) = ctx.saved_tensors
         resolution, channels = ctx.shape[1], ctx.shape[3]
         out = points.new_zeros(ctx.shape)

@@ -1,4 +1,4 @@
-"""The UNet parts that 2D Parsing and 3D Wrapping share."""
+"""UNet blocks of 2D Parsing and 3D Wrapping."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 LEAST_SPREAD = 1e-4
-"""Outputs that differ less between samples are not blown up further."""
+"""Outputs with a smaller standard deviation over the samples are not scaled."""
 
 
 class ConvBlock(nn.Module):
-    """Two 3x3 convolutions with leaky rectifiers.
+    """Two 3x3 convolutions with leaky ReLUs.
 
-    No normalisation: absolute brightness is the very thing that the networks here have to carry, and a
-    function of single pictures must not depend on batch statistics.
+    There is no normalisation, because the networks have to preserve absolute brightness and must not depend on
+    batch statistics.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -49,7 +49,7 @@ class UpBlock(nn.Module):
 
 
 class UNet(nn.Module):
-    """A plain UNet: `widths[0]` channels at full resolution, each further entry at half the one before."""
+    """A plain UNet with `widths[0]` channels at full resolution; each further level halves the resolution."""
 
     def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int) -> None:
         super().__init__()
@@ -77,9 +77,9 @@ class UNet(nn.Module):
 
 @torch.no_grad()
 def standardize_output(layer: nn.Linear, samples: Float[Tensor, "B O"]) -> None:
-    """Gives a layer's outputs, of which `samples` are examples, mean 0 and spread 1 each, where they spread at all.
+    """Scales a layer so that its outputs, of which `samples` are examples, have mean 0 and standard deviation 1.
 
-    A start that suits the data, as Mishkin and Matas 2016 ('All you need is a good init') give it to every layer.
+    A data-dependent initialisation after Mishkin and Matas 2016 ('All you need is a good init').
     """
     spread = samples.std(dim=0)
     spread = spread.where(spread > LEAST_SPREAD, 1.0)

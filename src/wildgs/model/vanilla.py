@@ -1,4 +1,4 @@
-"""Plain 3D Gaussian Splatting (Kerbl et al. 2023) on the same engine: the paper's baseline `3dgs`."""
+"""Plain 3D Gaussian Splatting (Kerbl et al. 2023), the baseline `3dgs`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SH_DEGREE = 3
 
 
 class VanillaGS(Method):
-    """Every Gaussian owns its spherical harmonics; photos have no say in the colours."""
+    """Every Gaussian has its own spherical harmonics; colours do not depend on a photo."""
 
     name: ClassVar[str] = "3dgs"
     label: ClassVar[str] = "3DGS"
@@ -42,7 +42,7 @@ class VanillaGS(Method):
 
     @classmethod
     def create(cls, config: VanillaConfig, initial: InitialGaussians) -> VanillaGS:
-        """Starts from the points' colours."""
+        """Initialises SH degree 0 from the points' colours."""
         harmonics = {
             "sh0": rgb_to_sh0(initial.colors)[:, None],
             "shN": torch.zeros(len(initial.colors), *cls.rows(config)["shN"]),
@@ -51,11 +51,11 @@ class VanillaGS(Method):
 
     @classmethod
     def blank(cls, config: VanillaConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> VanillaGS:
-        """The Gaussians hold everything."""
+        """Creates the method from the Gaussians, which hold all parameters."""
         return cls(config, gaussians)
 
     def row_rates(self) -> dict[str, LearningRate]:
-        """Those of the harmonics."""
+        """Learning rates of the harmonics."""
         rates = self.config.learning_rates
         return {"sh0": LearningRate(rates.sh0), "shN": LearningRate(rates.shN)}
 

@@ -1,4 +1,4 @@
-"""Wild-GS whole: the paper's figure 2 as wiring, nothing else."""
+"""The method Wild-GS, which connects the modules of the paper's figure 2."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from wildgs.rasterize import Projection, blend
 
 
 class WildGS(Method):
-    """Gaussians whose colours are fused from a photo's global light, its local light, and their own nature."""
+    """Gaussians whose colours are predicted from global embedding, local embedding and intrinsic feature."""
 
     name: ClassVar[str] = "wildgs"
     label: ClassVar[str] = "Wild-GS"
@@ -42,7 +42,14 @@ class WildGS(Method):
     def __init__(
         self, config: WildGSConfig, gaussians: Gaussians, box: Box, encoder: Encoder | None = None
     ) -> None:
-        """Takes Gaussians with a row `intrinsic`, the triplane's box, and an encoder if not the one configured."""
+        """Creates the method.
+
+        Args:
+            config: Configuration.
+            gaussians: Gaussians with a row `intrinsic`.
+            box: Bounding box of the triplane.
+            encoder: Replaces the configured encoder.
+        """
         super().__init__()
         self.config = config
         self.gaussians = gaussians
@@ -60,7 +67,7 @@ class WildGS(Method):
 
     @classmethod
     def rows(cls, config: WildGSConfig) -> dict[str, tuple[int, ...]]:
-        """Geometry and f^in."""
+        """Geometry and the intrinsic feature f^in."""
         return GEOMETRY_ROWS | {"intrinsic": (config.fusion.intrinsic_size,)}
 
     @classmethod
@@ -72,7 +79,7 @@ class WildGS(Method):
     def create(
         cls, config: WildGSConfig, initial: InitialGaussians, encoder: Encoder | None = None
     ) -> WildGS:
-        """Starts at the coloured first Gaussians; the triplane covers the central part of the SfM points."""
+        """Initialises intrinsic features from the points' colours, and the triplane's box from the SfM points."""
         ratio = 1.0 if "crop" in config.without else config.wrapping.crop_ratio
         box = robust_box(initial.points, config.wrapping.box_quantile, ratio)
         intrinsic = torch.zeros(len(initial.colors), config.fusion.intrinsic_size)
@@ -85,31 +92,31 @@ class WildGS(Method):
 
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
-        """With a fresh encoder and any box."""
+        """Creates the method with an untrained encoder and an arbitrary box."""
         box = Box(torch.zeros(3), torch.ones(3))
         model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
-        if "photo_match.codes.weight" not in state:  # of an earlier version
+        if "photo_match.codes.weight" not in state:  # checkpoint of an earlier version
             model.photo_match.codes = None
         model.light_basis.components = state.get("light_basis.components")
         return model
 
     def growable(self) -> Bool[Tensor, " N"] | None:
-        """All but the sky, unless configured."""
+        """All Gaussians except the sky, unless `sky.densify` is set."""
         sky = None if self.config.sky.densify else self.sky()
         return None if sky is None else ~sky
 
     def sky(self) -> Bool[Tensor, " N"] | None:
-        """Those far from the scene; see `wildgs.model.sky.find_sky`."""
+        """Gaussians far from the scene; see `wildgs.model.sky.find_sky`."""
         sky = self.photo_match.sky(self.gaussians.means, self._centre)
         return None if sky is None else sky.which
 
     def row_rates(self) -> dict[str, LearningRate]:
-        """That of f^in."""
+        """Learning rate of f^in."""
         rates = self.config.learning_rates
         return {"intrinsic": LearningRate(rates.intrinsic, rates.decay)}
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """The networks, and apart from them the encoder."""
+        """All networks except the encoder, and the encoder."""
         rates = self.config.learning_rates
         encoder = list(self.parsing.encoder.parameters())
         owned = {id(p) for p in (*encoder, *self.gaussians.parameters())}
@@ -120,17 +127,17 @@ class WildGS(Method):
         ]
 
     def appearance_parameters(self) -> tuple[str, ...]:
-        """The centres, at which planes are sampled, the fusion network and the basis of lights."""
+        """The fusion network, the centres (at which planes are sampled), light basis and colour match."""
         return ("fusion.", "gaussians.rows.means", "light_basis.", "photo_match.")
 
     @property
     def map_columns(self) -> int:
-        """Those of `PhotoMatch`."""
+        """Columns of a colour map; see `PhotoMatch`."""
         return self.photo_match.columns
 
     @property
     def basis_size(self) -> int:
-        """Components of the basis of lights."""
+        """Number of components of the light basis."""
         return 0 if self.light_basis.components is None else len(self.light_basis.components)
 
     @property
@@ -141,19 +148,19 @@ class WildGS(Method):
         return part in self.config.without
 
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:
-        """Gives a fresh encoder its normalisation statistics."""
+        """Calibrates 2D Parsing."""
         self.parsing.calibrate(photos)
 
     def final_photos(self) -> int:
-        """As many as the basis of lights can be learnt from."""
+        """Number of photos from which the light basis is computed."""
         if not (self.config.color_match and self.config.light_components):
             return 0
         return self.light_basis.affordable_lights(self.num_gaussians, (self.sh_degree + 1) ** 2)
 
     @torch.no_grad()
     def finish(self, photos: Iterable[SeenPhoto]) -> None:
-        """Learns the basis of lights."""
-        self.light_basis.components = None  # or the lights would be fitted in the old one
+        """Computes the light basis."""
+        self.light_basis.components = None  # otherwise the lights would be fitted in the previous basis
         lights = (
             self.shade(self.encode(seen.photo, seen.camera, seen.keep, name=seen.name)) for seen in photos
         )
@@ -179,7 +186,7 @@ class WildGS(Method):
             projection = self.gaussians.project(camera)
         if self._wraps:
             appearance = self.wrap(photo, appearance, projection, keep)
-        # A picture of anything shows other things than the scene does: pixels of the two say nothing together.
+        # Without trust in the mask, the image shows another scene, so that comparing pixels is meaningless.
         if not (self.config.color_match and trust_mask):
             return appearance
         sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
@@ -194,7 +201,7 @@ class WildGS(Method):
     def _matched(
         self, colors: Float[Tensor, "V 3"], rows: Int[Tensor, " V"], sight: Sight
     ) -> Float[Tensor, "V 3"]:
-        """Colours of Gaussians in training, changed towards those of their photo."""
+        """Applies the colour match, scaled by `matched_loss`, to colours in training."""
         match, centre = self.photo_match, self._centre
         intrinsic = take_rows(self.gaussians.rows["intrinsic"], rows)
         with torch.no_grad():
@@ -210,7 +217,7 @@ class WildGS(Method):
         return (self.wrapping.low + self.wrapping.high) / 2
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
-        """M, by 2D Parsing alone."""
+        """The mask M, by 2D Parsing only."""
         return self.parse(photo).visibility
 
     def parse(
@@ -221,7 +228,7 @@ class WildGS(Method):
         learn_mask: bool = True,
         name: str | None = None,
     ) -> Appearance:
-        """2D Parsing: mask and global embedding; local appearance is left to v."""
+        """2D Parsing: mask and global embedding; the local embedding is v everywhere."""
         visibility, embedding = self.parsing(
             photo, learn_encoder=learn_encoder, learn_mask=learn_mask, name=name
         )
@@ -238,14 +245,14 @@ class WildGS(Method):
         *,
         learn: bool = True,
     ) -> Appearance:
-        """3D Wrapping: adds the triplane, from depth that takes no gradient.
+        """3D Wrapping: adds the triplane, from rendered depth without gradient.
 
         Args:
             photo: RGB in [0, 1].
             appearance: From `parse`.
-            projection: The Gaussians as the photo's camera sees them; only geometry is used.
-            keep: The user's own mask: pixels that are False are not lifted.
-            learn: Whether gradients reach U^3D.
+            projection: Projection of the Gaussians to the photo's camera.
+            keep: The user's mask: False = do not lift the pixel.
+            learn: Whether U^3D gets gradients.
         """
         with torch.no_grad():
             geometry = blend(projection, None)
@@ -259,7 +266,7 @@ class WildGS(Method):
     def _lifted_in_training(
         self, photo: Float[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None
     ) -> Bool[Tensor, "H W"] | None:
-        """The user's own mask; now and then, a random part of the picture alone."""
+        """The user's mask, in some steps restricted to a random part of the image (`partial_lifts`)."""
         if torch.rand(()) >= self.config.wrapping.partial_lifts:
             return keep
         height, width = photo.shape[:2]
@@ -267,21 +274,21 @@ class WildGS(Method):
         return part if keep is None else keep & part
 
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
-        """Carries an appearance to the Gaussians."""
+        """Samples local embeddings at the Gaussians."""
         means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
         return Embeddings(appearance.global_embedding, local, appearance.color_map, appearance.basis_weights)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """Fuses to spherical harmonics: sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) for the given Gaussians."""
+        """Spherical harmonics sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) of the given Gaussians, plus the light basis."""
         harmonics = self._fused(embeddings, rows)
         if embeddings.basis_weights is None:
             return harmonics
         return harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
 
     def _fused(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None) -> Float[Tensor, "N K 3"]:
-        """What the networks and the colour match make of embeddings."""
+        """Spherical harmonics by the fusion network and the colour match."""
         intrinsic = self.gaussians.rows["intrinsic"]
         if rows is not None:
             intrinsic = take_rows(intrinsic, rows)
@@ -307,7 +314,7 @@ class WildGS(Method):
         *,
         name: str | None = None,
     ) -> TrainingOutput:
-        """The photo is its own reference; one projection serves the depth pass and the colours."""
+        """Renders the photo under its own appearance, with one projection for all passes."""
         appearance = self.parse(
             photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask, name=name
         )

@@ -1,4 +1,4 @@
-"""3D Wrapping (paper, figure 2 right): pixels lifted to a cloud, the triplane, and local embeddings."""
+"""3D Wrapping (paper, figure 2 right): back-projection of pixels, the triplane, and local embeddings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wildgs.model.triplane import PICTURE_CHANNELS, Box, project_cloud, sample_p
 from wildgs.model.unet import UNet, standardize_output
 
 MIN_ALPHA = 0.5
-"""Rendered depth means something only where the Gaussians cover a pixel."""
+"""Smallest accumulated alpha of a pixel for its rendered depth to be used."""
 
 
 def liftable(
@@ -26,7 +26,7 @@ def liftable(
 
 
 def random_part(height: int, width: int, device: torch.device | str = "cpu") -> Bool[Tensor, "H W"]:
-    """What lies on one side of a straight cut, upright or level, through the middle half of a picture."""
+    """A mask of one side of a random vertical or horizontal cut through the middle half of an image."""
     place, upright, kept_first = torch.rand(3).tolist()
     length = width if upright < 0.5 else height
     first = torch.arange(length, device=device) < round((0.25 + 0.5 * place) * length)
@@ -38,7 +38,7 @@ def random_part(height: int, width: int, device: torch.device | str = "cpu") -> 
 def lift(
     photo: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], camera: Camera
 ) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-    """BP: all pixels as world points P and their colours C, row by row.
+    """Back-projection BP: all pixels as world points P and their colours C, in row-major order.
 
     Args:
         photo: RGB in [0, 1].
@@ -49,13 +49,19 @@ def lift(
 
 
 class Wrapping(MixedModule):
-    """Coloured cloud -> six pictures -> U^3D -> Emb^l per point; the learnable v outside the box."""
+    """Coloured cloud -> six projections -> U^3D -> Emb^l per point; the learnable v outside the box."""
 
     low: Tensor
     high: Tensor
 
     def __init__(self, config: WrappingConfig, box: Box, *, reverse: bool = True) -> None:
-        """Covers a box; without `reverse`, the reverse projections c' are left out (the ablation 'w/o {c'}')."""
+        """Creates the networks.
+
+        Args:
+            config: Configuration.
+            box: Bounding box of the triplane.
+            reverse: Whether to use the reverse projections c' (False: ablation 'w/o {c'}').
+        """
         super().__init__()
         self.config = config
         self.reverse = reverse
@@ -70,7 +76,7 @@ class Wrapping(MixedModule):
 
     @property
     def box(self) -> Box:
-        """The AABB that the triplane covers."""
+        """The bounding box of the triplane."""
         return Box(self.low, self.high)
 
     def planes(
@@ -83,12 +89,12 @@ class Wrapping(MixedModule):
     ) -> Float[Tensor, "3 C R R"]:
         """F^T: feature maps of XY, YZ and ZX from a coloured cloud in world coordinates; see `project_cloud`.
 
-        `learn` says whether gradients reach U^3D.
+        `learn` is whether U^3D gets gradients.
         """
         pictures = project_cloud(self.box.normalize(points), colors, self.config.resolution, keep)
         if not self.reverse:
             pictures = pictures[:, :1]
-        # Only what could learn is recorded, and a replay keeps nothing that no backward pass asks for.
+        # CUDA graphs are captured with gradients only; replaying one costs nothing without a backward pass.
         with torch.set_grad_enabled(torch.is_grad_enabled() and (learn or self.replays.records(pictures))):
             (planes,) = self.replays(self._networks, (self.unet,), pictures.flatten(1, 2))
         return planes if learn else planes.detach()
@@ -99,10 +105,10 @@ class Wrapping(MixedModule):
 
     @torch.no_grad()
     def calibrate(self, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]) -> None:
-        """Starts with local embeddings that tell points apart: mean 0 and spread 1 over a coloured cloud.
+        """Scales initial local embeddings to mean 0 and variance 1 over a coloured cloud.
 
         Args:
-            points: World coordinates, the SfM points.
+            points: SfM points, world coordinates.
             colors: RGB in [0, 1].
         """
         inside = self.box.contains(points)
@@ -117,14 +123,14 @@ class Wrapping(MixedModule):
     ) -> Float[Tensor, "N L"]:
         """Emb^l of every Gaussian: sampled from the planes inside the box, v outside or without planes.
 
-        The centres get no gradient: the appearance of one photo should not move the geometry of all.
+        The centres get no gradient, so that the appearance of single photos does not affect the geometry.
         """
         everywhere = self.outside.expand(len(means), -1)
         if planes is None:
             return everywhere
         means = means.detach()
         inside = self.box.contains(means)
-        # Of what a photo shows, about half lies outside.
+        # About half of the visible Gaussians are outside.
         rows = rows_to_shade(inside)
         sampled = sample_planes(planes, self.box.normalize(means[rows]))
         with self.mixed(means.device):
