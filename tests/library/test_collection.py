@@ -121,7 +121,7 @@ def test_other_options_than_those_of_the_poses_are_refused(photos: Path, scene: 
 def test_an_output_among_the_photos_is_refused(photos: Path, inside: str) -> None:
     """Its pictures would be photos of the next run."""
     for verb in (wildgs.run, wildgs.reconstruct):
-        with pytest.raises(UserError, match="lies in the folder of the photos"):
+        with pytest.raises(UserError, match="is inside the folder of the photos"):
             verb(photos, photos / inside)
     assert len(list(photos.rglob("*"))) == 4
 

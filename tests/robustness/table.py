@@ -31,7 +31,7 @@ _MODEL: dict[str, Cell] = {
     "truncated": ("error", "the COLMAP model cannot be read", "error"),
     "wrong type": ("error", "the COLMAP model cannot be read", "error"),
     "wrong size": ("error", "camera 1 is 0x16 pixels", "error: a camera without area, or over 10^6 wide"),
-    "NaN": ("left out", r"p02\.png.*its pose is not finite", "photo left out; such points are dropped"),
+    "NaN": ("left out", r"p02\.png.*its pose is non-finite", "photo left out; such points are dropped"),
     "huge": ("error", "the COLMAP model cannot be read", "error, before anything is allocated"),
     "duplicate": ("error", "in the COLMAP model twice", "error"),
     "names": ("used", "", "used"),
@@ -66,7 +66,7 @@ TABLE: dict[str, dict[str, Cell]] = {
     "COLMAP binary": _MODEL,
     "COLMAP text": _MODEL
     | {
-        "empty": ("error", "holds no photo with a pose", "error"),
+        "empty": ("error", "has no photos with a pose", "error"),
         "truncated": ("error", "the COLMAP model cannot be read", "error; between two lines: a warning"),
     },
     "split .tsv": {

@@ -136,8 +136,10 @@ def test_lights_are_those_that_were_written(scene: Scene, tmp_path: Path, file: 
         os.mkfifo(path)
     elif change != "lost":
         Image.new("RGB" if file.endswith("jpg") else "1", (48, 32), 1).save(path)
-    said = {"lost": "no such file", "a pipe": "not a regular file"}.get(change, "damaged, or of another run")
-    with pytest.raises(UserError, match=rf"{file}: {said}.*{view.name}.*copy the whole run folder again"):
+    said = {"lost": "no such file", "a pipe": "not a regular file"}.get(
+        change, "damaged, or from another run"
+    )
+    with pytest.raises(UserError, match=rf"{file}: {said}.*{view.name}.*copy the complete run folder again"):
         view.read_photo()
 
 
@@ -169,7 +171,7 @@ def test_a_record_cut_short_is_one_line(scene: Scene, tmp_path: Path, keep: int)
     carry_scene(tmp_path, scene)
     content = (tmp_path / SCENE_FILE).read_bytes()
     (tmp_path / SCENE_FILE).write_bytes(content[:keep])
-    with pytest.raises(UserError, match=r"scene\.safetensors.*copy the run folder again"):
+    with pytest.raises(UserError, match=r"scene\.safetensors.*copy the complete run folder again"):
         read_carried_scene(tmp_path)
 
 

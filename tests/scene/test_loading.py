@@ -264,7 +264,7 @@ def test_no_readable_photo_is_an_error(make_scene: MakeScene) -> None:
     root = make_scene(2)
     for path in (root / "images").iterdir():
         path.write_bytes(b"")
-    with pytest.raises(UserError, match="no photo to train can be read"):
+    with pytest.raises(UserError, match="no training photo can be read"):
         load_scene(root)
 
 
@@ -366,8 +366,8 @@ def test_a_split_that_names_missing_photos_warns_once(make_scene: MakeScene) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (SPLIT + "gone.png\t1\ttrain\tx\n", r"split\.tsv: the split leaves no photo to train.*gone\.png"),
-        (SPLIT + "p00.png\t1\ttest\tx\n", "leaves no photo to train"),
+        (SPLIT + "gone.png\t1\ttrain\tx\n", r"split\.tsv: the split leaves no training photo.*gone\.png"),
+        (SPLIT + "p00.png\t1\ttest\tx\n", "leaves no training photo"),
         (SPLIT + "p00.png\t1\tvalidation\tx\n", "'validation'; it must be train or test"),
         ("name,split\np00.png,train\n", "tab-separated columns"),
         ("", "tab-separated columns"),
@@ -431,7 +431,7 @@ def test_a_mask_may_have_the_photos_own_name(make_scene: MakeScene) -> None:
     root = make_scene(names=["x.jpg", "y.jpg"])
     (root / "masks").mkdir()
     Image.new("L", (W, H), 0).save(root / "masks" / "x.jpg")
-    with pytest.warns(WildGSWarning, match=r"1 photos are masked completely.*x\.jpg.*0 is what is ignored"):
+    with pytest.warns(WildGSWarning, match=r"1 photos are masked completely.*x\.jpg.*0 = ignore the pixel"):
         first, second = load_scene(root, DataConfig(holdout=0)).views
     mask = first.read_mask()
     assert mask is not None

@@ -161,7 +161,7 @@ def test_an_existing_scene_is_replaced_only_on_demand(tmp_path: Path, corner: Co
     output.mkdir()
     (output / "keep.txt").write_text("the user's")
     reconstruct(photos, output)
-    with pytest.raises(UserError, match="already holds a scene"):
+    with pytest.raises(UserError, match="already contains a scene"):
         reconstruct(photos, output)
     (photos / "photo 3.jpg").unlink()
     assert len(reconstruct(photos, output, overwrite=True).registered) == 3
@@ -307,7 +307,7 @@ def test_the_faster_of_two_reconstructions_stays(
         (tmp_path / "out" / reconstruction.REPORT_NAME).touch()
 
     monkeypatch.setattr(reconstruction, "_write_scene", slow)
-    with pytest.raises(UserError, match="already holds a scene"):
+    with pytest.raises(UserError, match="already contains a scene"):
         reconstruct(photos, tmp_path / "out")
 
 
@@ -335,7 +335,7 @@ def test_options_that_mean_nothing_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "stage"), [(signal.SIGTERM, "finding features"), (signal.SIGHUP, "finding poses")]
+    ("number", "stage"), [(signal.SIGTERM, "extracting features"), (signal.SIGHUP, "finding poses")]
 )
 def test_after_a_signal_the_same_call_continues(
     tmp_path: Path, corner: Corner, monkeypatch: pytest.MonkeyPatch, number: int, stage: str
@@ -351,7 +351,7 @@ def test_after_a_signal_the_same_call_continues(
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
     assert "TerminatedError: terminated" in ended.stderr
     assert "***" not in ended.stderr
-    assert "the same command continues" in ended.stderr
+    assert "run the same command to continue" in ended.stderr
     monkeypatch.setattr(reconstruction, "copy_upright", None)  # not called again
     assert len(reconstruct(photos, tmp_path / "out").registered) == 4
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "p"]
@@ -361,10 +361,10 @@ def test_folders_of_others_are_never_written_over(tmp_path: Path, corner: Corner
     scene = tmp_path / "scene"
     scene.mkdir()
     photos = save_photos(scene / "images", corner[0][:2])
-    with pytest.raises(UserError, match="photos lie in this folder"):
+    with pytest.raises(UserError, match="photos are in this folder"):
         reconstruct(photos, scene, overwrite=True)
     elsewhere = save_photos(tmp_path / "p", corner[0][:2])
-    with pytest.raises(UserError, match="did not make"):
+    with pytest.raises(UserError, match="not made by"):
         reconstruct(elsewhere, scene, overwrite=True)
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="is a file"):

@@ -32,7 +32,10 @@ def interrupt(photos: Path, output: Path) -> list[WorkingCopy]:
         WorkingCopy("a.jpg", "0.jpg", "a.jpg", False, place),
         WorkingCopy("b.jpg", "1.jpg", "b.jpg", True),
     ]
-    with pytest.warns(WildGSWarning, match="the same command continues"), pytest.raises(KeyboardInterrupt):
+    with (
+        pytest.warns(WildGSWarning, match="run the same command to continue"),
+        pytest.raises(KeyboardInterrupt),
+    ):
         work_until_interrupted(photos, output, copies)
     return copies
 
@@ -61,7 +64,7 @@ def test_a_damaged_database_is_not_continued(photos: Path, tmp_path: Path, damag
         pass
     database.write_bytes(damage(database.read_bytes()))
     with (
-        pytest.warns(WildGSWarning, match="damaged; beginning anew"),
+        pytest.warns(WildGSWarning, match="damaged; starting again"),
         open_workplace(photos, tmp_path / "out", SfmConfig()) as work,
     ):
         assert not work.is_done("matches")

@@ -157,7 +157,7 @@ def test_a_picture_that_cannot_be_used_is_no_success(
     text = "document.body.innerText"
     wait_for(lambda: "Upload failed" in page.evaluate(text))
     time.sleep(1)
-    assert "not a readable picture" in page.evaluate(text)
+    assert "not a readable image" in page.evaluate(text)
     assert "successfully" not in page.evaluate(text)
     assert "Uploading" not in page.evaluate(text)
     assert viewer.lighting.desk.first == before.first or "broken" not in viewer.lighting.desk.first.label

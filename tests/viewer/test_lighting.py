@@ -73,7 +73,7 @@ def png(picture: Image.Image) -> bytes:
 
 @pytest.mark.parametrize("content", [b"", b"no picture"])
 def test_what_is_no_picture_is_one_line_and_leaves_nothing(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(UserError, match="not a readable picture"):
+    with pytest.raises(UserError, match="not a readable image"):
         store_upload(tmp_path, 1, "a.jpg", content)
     assert list(tmp_path.iterdir()) == []
 

@@ -45,7 +45,7 @@ def uploads(replies: Replies, taken: list[tuple[str, bytes]]):
 
     def take(name: str, content: bytes) -> None:
         if name == "bad":
-            raise UserError("not a readable picture")
+            raise UserError("not a readable image")
         if name == "fault":
             raise RuntimeError("a fault")
         taken.append((name, content))

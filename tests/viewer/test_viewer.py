@@ -191,7 +191,7 @@ def test_visiting_a_photo_shows_it_beside_its_render(viewer: Viewer, wall: Scene
 def test_a_picture_that_cannot_be_used_changes_nothing(viewer: Viewer) -> None:
     before, desk = colors(viewer), viewer.lighting.desk
     for content in (b"no picture", b""):
-        with pytest.raises(UserError, match="not a readable picture"):
+        with pytest.raises(UserError, match="not a readable image"):
             viewer.lighting.take_picture("mine.jpg", content)
     work_off(viewer)
     assert viewer.lighting.desk == desk, "the light before stays chosen"

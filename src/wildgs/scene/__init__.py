@@ -1,11 +1,11 @@
-"""Photos, cameras and sparse points: from a folder to a `Scene`."""
+"""Scenes: photos, cameras and sparse points, read from a folder."""
 
 from __future__ import annotations
 
 import importlib
 
-# First of all the libraries that load the system's zlib: pycolmap exports a zlib of its own, and one that is
-# loaded after it would mix its functions with pycolmap's and corrupt the memory when a PNG is written.
+# The system's zlib must be loaded before pycolmap, which exports its own zlib symbols; mixing the two corrupts
+# memory when a PNG is written.
 import zlib  # noqa: F401
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ _MODULES = {"DataConfig": "wildgs.scene.config", "load_scene": "wildgs.scene.loa
 
 
 def __getattr__(name: str) -> Any:
-    """Imported when first asked for: `wildgs.scene.config` must not wait for torch."""
+    """Imports names at their first use, so that `wildgs.scene.config` does not import torch."""
     if name not in _MODULES:
         raise AttributeError(f"module 'wildgs.scene' has no attribute {name!r}")
     return getattr(importlib.import_module(_MODULES[name]), name)

@@ -1,7 +1,7 @@
-"""The scene's own axes: up is +z, the ground's principal directions are x and y, the usual depth is 1.
+"""The aligned frame: up is +z, the principal directions of the ground are x and y, the median depth is 1.
 
-COLMAP's frame is arbitrary in rotation and scale. The triplane (paper, section on 3D Wrapping) projects along
-the world's axes, so the axes must lie along the scene's.
+COLMAP's frame has an arbitrary rotation and scale, but the triplane (paper, section on 3D Wrapping) projects along
+the axes, which therefore should be those of the scene.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from wildgs.geometry.camera import Camera
 from wildgs.scene.scene import Alignment
 
 INLIER_SHARE = 0.9
-"""Share of the points, nearest first, from which the principal directions are taken."""
+"""Fraction of the points, nearest first, from which the principal directions are computed."""
 
 LEVEL_TOLERANCE = 0.02
-"""Sine of the roll with which people hold a camera level; rolls beyond it count less and less."""
+"""Sine of the typical roll of a hand-held camera; larger rolls have decreasing weight."""
 
 PRIOR_WEIGHT = 0.01
 """Weight of the mean up vector against the horizontal axes (whose mean square cosine is up to 1/2)."""
@@ -30,34 +30,34 @@ def align_world(
     points: Float[Tensor, "P 3"],
     view_depths: Sequence[float],
 ) -> Alignment:
-    """Find the similarity that takes the input's frame to the aligned one.
+    """Computes the similarity transform from the input's frame to the aligned frame.
 
     Args:
         cameras: All registered cameras in the input's frame.
         points: Sparse points in the input's frame; at least one.
-        view_depths: For each view that sees any, the median depth of its own points, input units.
+        view_depths: Median depth of the observed points of each view that has any, in input units.
 
     Returns:
-        A right-handed similarity. Signs follow the scene (the cameras' mean lies on the -y side, as one who
-        faces north), so the same scene in another input frame comes out the same.
+        A right-handed similarity. Signs of the axes are determined by the scene (the mean of the cameras is on the
+        -y side), so that the result does not depend on the input's frame.
     """
     points = points.to(torch.float64)
     positions = torch.stack([camera.position.to(torch.float64) for camera in cameras])
     up = _estimate_up(torch.stack([camera.viewmat[:3, :3].to(torch.float64) for camera in cameras]))
     centre = points.median(dim=0).values
     rotation = _ground_axes(up, points - centre, positions - centre)
-    # The median of each coordinate depends on the axes, so it is taken once more along the final ones.
+    # The coordinatewise median depends on the axes, so it is computed again for the final ones.
     centre = (points @ rotation.T).median(dim=0).values
     scale = _unit_depth_scale(points, positions, view_depths)
     return Alignment(rotation=rotation, translation=-scale * centre, scale=scale)
 
 
 def _estimate_up(rotations: Float[Tensor, "V 3 3"], iterations: int = 20) -> Float[Tensor, "3"]:
-    """The direction away from the ground, from the cameras' axes.
+    """Estimates the up direction from the cameras' axes.
 
-    The mean of the pictures' up vectors leans as far as the photographers tilt their cameras (all of them
-    upwards, under a tower). Their horizontal axes do not lean, so the direction most at right angles to them,
-    by least absolute cosines, corrects the mean; where all photos face one way, it stays.
+    The mean of the cameras' up vectors is biased if photographers tilt their cameras (upwards, below a tower), but
+    their horizontal axes are not. The mean is corrected to the direction that is most perpendicular to these axes,
+    by least absolute cosines. If all photos have the same viewing direction, the mean is kept.
     """
     right = rotations[:, 0]
     prior = _robust_mean(-rotations[:, 1])
@@ -71,13 +71,13 @@ def _estimate_up(rotations: Float[Tensor, "V 3 3"], iterations: int = 20) -> Flo
 
 
 def _robust_mean(directions: Float[Tensor, "V 3"], iterations: int = 50) -> Float[Tensor, "3"]:
-    """Geometric median of unit vectors (Weiszfeld): a few photos held sideways do not tilt the world."""
+    """Geometric median of unit vectors (Weiszfeld), robust against a few rotated photos."""
     mean = directions.mean(dim=0)
     for _ in range(iterations):
         weights = 1.0 / (directions - mean).norm(dim=-1).clamp_min(1e-6)
         mean = (weights[:, None] * directions).sum(dim=0) / weights.sum()
     length = float(mean.norm())
-    if length < 1e-6:  # ups that cancel out: no direction is better than the first photo's
+    if length < 1e-6:  # the directions cancel out
         return directions[0] / directions[0].norm()
     return mean / length
 
@@ -111,7 +111,7 @@ def _ground_axes(
 def _prefers_flip(
     y_axis: Float[Tensor, "3"], points: Float[Tensor, "P 3"], positions: Float[Tensor, "V 3"]
 ) -> bool:
-    """Whether y must turn round so that the cameras lie on its negative side (for a ring, the points)."""
+    """Whether y must be negated so that the cameras (of a ring: the points) are on its negative side."""
     camera_side = float((positions @ y_axis).mean())
     spread = float((positions @ y_axis).abs().mean())
     if abs(camera_side) > 1e-3 * max(spread, 1e-12):

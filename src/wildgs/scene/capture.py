@@ -1,4 +1,4 @@
-"""When and where a photo was taken, carried to copies of it."""
+"""Copies capture time and GPS position of photos to copies of them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _TIMES = (
 
 
 def carry_capture(source: Path, target: Path) -> None:
-    """Gives a JPEG file the times and the position in another one's EXIF block, if it has any.
+    """Copies times and GPS position from a photo's EXIF data to a JPEG file, if there are any.
 
-    The pixels are not encoded again: the block is put before the file's other segments. Focal length and
-    orientation are left out, since copies are undistorted and upright.
+    The pixels are not encoded again; the EXIF segment is inserted before the others. Focal length and orientation
+    are not copied, since copies are undistorted and upright.
     """
     try:
         with Image.open(source) as image:
@@ -36,7 +36,7 @@ def carry_capture(source: Path, target: Path) -> None:
         if not any(kept.get_ifd(block) for block in (IFD.Exif, IFD.GPSInfo)):
             return
         block = kept.tobytes()
-    except Exception:  # a broken EXIF block costs the time, not the photo
+    except Exception:  # invalid EXIF data is ignored
         return
     content = target.read_bytes()
     if content.startswith(_START) and len(block) <= _MOST_BYTES:

@@ -1,7 +1,7 @@
-"""A scene as a run folder carries it, so that the run works without the scene folder.
+"""The copy of a scene in a run folder, with which the run works without the scene folder.
 
-`scene.safetensors` holds cameras, split, alignment, points and their observations. `lights/` holds each photo, made
-smaller where it is large, and its mask: what the photo's appearance is read from.
+`scene.safetensors` contains cameras, split, alignment, points and their observations. `lights/` contains reduced
+copies of the photos and their masks, from which appearances are computed.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ SCENE_FILE = "scene.safetensors"
 LIGHTS_FOLDER = "lights"
 
 MAX_SIDE = 512
-"""Long side of a carried photo, at most, in pixels."""
+"""Longest side of a copied photo in pixels."""
 
 MIN_SIDE = 64
 MAX_PIXELS = 160_000_000
-"""Pixels of all carried photos together: of more than about 800 photos each is smaller."""
+"""Total number of pixels of all copied photos; with more than about 800 photos, each is reduced further."""
 
 QUALITY = 95
-"""Of the JPEG files, without chroma subsampling."""
+"""JPEG quality, without chroma subsampling."""
 
 
 def carry_scene(folder: Path, scene: Scene, progress: Counter | None = None) -> None:
-    """Writes what a run needs of its scene into the run folder.
+    """Writes a copy of the scene to the run folder.
 
-    `scene.safetensors` comes last: where it is, all is there.
+    `scene.safetensors` is written last, so that it marks a complete copy.
 
     Args:
         folder: The run folder.
         scene: The scene with its photos.
-        progress: Called with (photos written, photos in all).
+        progress: Called with (photos written, total number of photos).
 
     Raises:
         UserError: The folder cannot be written to.
@@ -59,7 +59,7 @@ def carry_scene(folder: Path, scene: Scene, progress: Counter | None = None) -> 
         number, view = numbered
         try:
             photo = view.photos.get(view.name)
-        except UserError:  # gone since it was first read; training continues without it, too
+        except UserError:  # not readable any more; training continues without it, too
             return []
         return _write_photo(lights, number, photo, side, view.photos.file(view.name))
 
@@ -69,7 +69,7 @@ def carry_scene(folder: Path, scene: Scene, progress: Counter | None = None) -> 
 
 
 def carried_side(sizes: Sequence[tuple[int, int]]) -> int:
-    """The long side, in pixels, at which photos of these widths and heights are carried."""
+    """The longest side, in pixels, of copies of photos with these widths and heights."""
     pixels_per_side = sum(min(size) / max(size) for size in sizes)
     within_total = math.isqrt(int(MAX_PIXELS / max(pixels_per_side, 1e-9)))
     return max(MIN_SIDE, min(MAX_SIDE, within_total))
@@ -101,7 +101,7 @@ def _digest(file: Path) -> str:
 
 
 def _photo_file(lights: Path, number: int) -> Path:
-    """Numbered as the views are: photos' own names can be anything."""
+    """The file of a copied photo, numbered like the views, since photos' names may be invalid on other systems."""
     return lights / f"{number:05d}.jpg"
 
 
@@ -110,7 +110,7 @@ def _mask_file(lights: Path, number: int) -> Path:
 
 
 def read_carried_scene(folder: Path) -> Scene | None:
-    """The scene that a run folder carries; its photos are decoded on demand. None for runs of earlier versions.
+    """The copy of the scene in a run folder, with photos decoded on demand; None for runs of earlier versions.
 
     Raises:
         UserError: The file cannot be read.
@@ -122,21 +122,21 @@ def read_carried_scene(folder: Path) -> Scene | None:
 
 
 def describe_carried(folder: Path) -> str:
-    """One line about what a run folder carries, for the console."""
+    """Describes the copy of the scene in a run folder in one line, for the console."""
     files = [file for file in (folder / LIGHTS_FOLDER).glob("*") if file.is_file()]
     megabytes = (sum(file.stat().st_size for file in files) + (folder / SCENE_FILE).stat().st_size) / 1e6
     count = sum(file.suffix == ".jpg" for file in files)
     return (
-        f"{folder} carries its cameras, points and {count} photos of at most {MAX_SIDE} pixels "
-        f"({megabytes:.1f} MB): it works without the scene folder"
+        f"{folder} contains its cameras, points and {count} photos of at most {MAX_SIDE} pixels "
+        f"({megabytes:.1f} MB) and works without the scene folder"
     )
 
 
 class CarriedPhotos(PhotoStore):
-    """The photos in a run's `lights/`, at the size of their cameras (larger ones are interpolated)."""
+    """The photos in a run's folder `lights/`, upsampled to the size of their cameras if necessary."""
 
     def __init__(self, folder: Path, record: SceneRecord) -> None:
-        """Reads from a folder `lights/` the photos of a recorded scene."""
+        """Creates the store for the photos of a recorded scene in a folder `lights/`."""
         self._folder = folder
         self._numbers = {name: number for number, name in enumerate(record.names)}
         self._digests = record.carried
@@ -165,18 +165,18 @@ class CarriedPhotos(PhotoStore):
             return Photo(pixels, read_mask(self._checked(path), size) if self._carries(path) else None)
         except UnreadableImageError as error:
             raise UserError(
-                f"{path}: {error}; it is the run's copy of {name}: copy the whole run folder again"
+                f"{path}: {error}; this is the run's copy of {name}: copy the complete run folder again"
             ) from error
 
     def _carries(self, path: Path) -> bool:
         return path.name in self._digests if self._digests else is_there(path)
 
     def _checked(self, path: Path) -> Path:
-        """The path of a file that is the one written with the run; `UnreadableImageError` if it is another."""
+        """The path of a file after verifying its digest; raises `UnreadableImageError` if it does not match."""
         expected = self._digests.get(path.name)
         try:
             if expected is not None and _digest(path) != expected:
-                raise UnreadableImageError("damaged, or of another run")
+                raise UnreadableImageError("damaged, or from another run")
         except FileNotFoundError:
             raise UnreadableImageError("no such file") from None
         except OSError as error:

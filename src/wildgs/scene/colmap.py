@@ -1,4 +1,4 @@
-"""COLMAP models, binary or text, in the folder layouts that photo-tourism data comes in."""
+"""COLMAP models, binary or text, in the folder layouts of Phototourism data."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ LAYOUTS = (
     ("dense/sparse/0", "dense/images"),
     ("dense/sparse", "dense/images"),
 )
-"""Folders of a model and of its photos, relative to the scene; the first that holds a model counts."""
+"""Folders of the model and of its photos, relative to the scene; the first one with a model is used."""
 
 MAX_COORDINATE = 1e12
-"""Poses and points beyond it (in model units) are damage: single precision ends soon after."""
+"""Largest valid coordinate of poses and points, in model units."""
 
 MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
 
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """One registered photo as the model has it.
+    """A registered photo of the model.
 
     Attributes:
         name: Path relative to the image folder, with forward slashes.
         camera: pycolmap's camera (any model), for the stored pixel grid of the photo.
-        viewmat: World-to-camera in the model's own frame.
-        median_depth: Median depth of the points that this photo observes, None where it observes none.
+        viewmat: World-to-camera transform in the model's frame.
+        median_depth: Median depth of the points that this photo observes; None without observations.
     """
 
     name: str
@@ -59,9 +59,9 @@ class ColmapModel:
     Attributes:
         images_dir: The folder of the photos.
         images: Photos with poses.
-        points: Positions, in the model's own frame.
-        point_colors: Their colours.
-        observations: Which photo (row in `images`) triangulated which point (row in `points`).
+        points: Positions in the model's frame.
+        point_colors: Colours of the points.
+        observations: Index in `images` and index in `points` of each observation of a point in a photo.
     """
 
     images_dir: Path
@@ -72,10 +72,10 @@ class ColmapModel:
 
 
 def find_model(root: Path) -> tuple[Path, Path]:
-    """The folders of a scene's sparse model and of its photos.
+    """Finds the folders of a scene's sparse model and of its photos.
 
     Raises:
-        UserError: There is no scene, no model or no folder of photos.
+        UserError: The scene, the model or the folder of photos does not exist.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; give the folder of a COLMAP scene (images/ and sparse/0/)")
@@ -83,26 +83,26 @@ def find_model(root: Path) -> tuple[Path, Path]:
         model = root / sparse
         if any(all((model / name).is_file() for name in names) for names in MODEL_FILES):
             if not (root / images).is_dir():
-                raise UserError(f"{root / images}: no such folder; the photos of {model} belong there")
+                raise UserError(f"{root / images}: no such folder; put the photos of {model} there")
             return model, root / images
     raise UserError(
         f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or"
-        " dense/sparse; `wildgs sfm PHOTOS --output SCENE` makes one"
+        " dense/sparse; `wildgs sfm PHOTOS --output SCENE` creates one"
     )
 
 
 def read_model(root: Path) -> ColmapModel:
-    """Read the sparse model of a scene folder.
+    """Reads the sparse model of a scene folder.
 
     Args:
-        root: The scene's folder.
+        root: The scene folder.
 
     Returns:
-        All photos with a pose, in the order of their names, and the points with finite coordinates, in the
-        model's own frame (double precision).
+        All photos with a pose, sorted by name, and all points with finite coordinates, in the model's frame (double
+        precision).
 
     Raises:
-        UserError: The model is missing, cannot be read, holds no photo with a pose or no point.
+        UserError: The model is missing, cannot be read, or has no photos with a pose or no points.
     """
     folder, images_dir = find_model(root)
     binary = all((folder / name).is_file() for name in MODEL_FILES[0])
@@ -114,9 +114,7 @@ def read_model(root: Path) -> ColmapModel:
     with np.errstate(invalid="ignore"):
         finite = np.all(np.abs(records.points.xyz) < MAX_COORDINATE, axis=1)
     if not finite.any():
-        raise UserError(
-            f"{folder}: the COLMAP model holds no points, and training starts from them; triangulate it"
-        )
+        raise UserError(f"{folder}: the COLMAP model has no points, which training needs; triangulate it")
     viewmats = {image.image_id: _viewmat(image) for image in registered}
     depths = _median_depths(records.points, finite, viewmats)
     images = tuple(
@@ -135,7 +133,7 @@ def read_model(root: Path) -> ColmapModel:
 
 
 def _observations(points: PointRecords, finite: np.ndarray, image_ids: Sequence[int]) -> Int[Tensor, "T 2"]:
-    """Rows of photos and of finite points, for every observation of both."""
+    """Index of the photo and index of the finite point, for every observation."""
     order = np.argsort(np.array(image_ids, dtype=np.int64), kind="stable")
     ids = np.array(image_ids, dtype=np.int64)[order]
     found = np.searchsorted(ids, points.track_image).clip(max=len(ids) - 1)
@@ -146,14 +144,14 @@ def _observations(points: PointRecords, finite: np.ndarray, image_ids: Sequence[
 
 
 def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
-    """Photos with a camera and a pose that mean something, by name; the others are named in a warning."""
+    """Photos with a valid camera and pose, sorted by name; warns of the others."""
     images = sorted(records.images, key=lambda image: image.name)
     if not images:
         raise UserError(
-            f"{folder}: the COLMAP model holds no photo with a pose; run `wildgs sfm` on the photos"
+            f"{folder}: the COLMAP model has no photos with a pose; run `wildgs sfm` on the photos"
         )
     if len({image.image_id for image in images}) != len(images):
-        raise UserError(f"{folder}: two photos of the COLMAP model have one id; rebuild it")
+        raise UserError(f"{folder}: two photos of the COLMAP model have the same id; rebuild it")
     faults = {image.name: fault for image in images if (fault := _fault(image, records.cameras))}
     good = [image for image in images if image.name not in faults]
     described = describe_names([f"{name!r} ({fault})" for name, fault in faults.items()])
@@ -169,16 +167,16 @@ def _usable(records: ModelRecords, folder: Path) -> list[ImageRecord]:
 
 
 def _fault(image: ImageRecord, cameras: dict[int, Any]) -> str | None:
-    """Why a photo cannot be used, or None."""
+    """The reason why a photo cannot be used, or None."""
     camera = cameras.get(image.camera_id)
     if camera is None:
-        return f"there is no camera {image.camera_id}"
+        return f"camera {image.camera_id} does not exist"
     params = np.array(camera.params)
     if not np.isfinite(params).all() or not all(params[i] > 0 for i in camera.focal_length_idxs()):
-        return "its camera's parameters make no sense"
+        return "the parameters of its camera are invalid"
     pose = np.array([*image.quat, *image.translation])
     if not np.isfinite(pose).all() or np.abs(pose).max() > MAX_COORDINATE:
-        return "its pose is not finite"
+        return "its pose is non-finite"
     return None if np.linalg.norm(image.quat) > 1e-12 else "its rotation is zero"
 
 
@@ -189,7 +187,7 @@ def _refuse_repeated(names: Sequence[str], folder: Path) -> None:
 
 
 def _checked_name(name: str, folder: Path) -> str:
-    """A photo's name that stays within the image folder: other files are found, and written, by it."""
+    """Checks that a photo's name stays within the image folder, since paths of other files are derived from it."""
     path = PurePosixPath(name.replace("\\", "/"))
     outside = path.is_absolute() or ".." in path.parts or PureWindowsPath(name).drive
     outside = outside or (os.name == "nt" and ":" in name)
@@ -211,10 +209,10 @@ def _viewmat(image: ImageRecord) -> np.ndarray:
 def _median_depths(
     points: PointRecords, finite: np.ndarray, viewmats: dict[int, np.ndarray]
 ) -> dict[int, float]:
-    """Median depth of each photo's own points (those in its tracks), model units."""
+    """Median depth of the points that each photo observes, model units."""
     rows, photos = points.track_point, points.track_image
-    known = finite[rows]
-    rows, photos = rows[known], photos[known]
+    valid = finite[rows]
+    rows, photos = rows[valid], photos[valid]
     if len(rows) == 0:
         return {}
     order = np.argsort(photos, kind="stable")
@@ -230,6 +228,6 @@ def _median_depths(
 
 
 def describe_names(names: Sequence[str], limit: int = 3) -> str:
-    """The first few names for a message, with how many more there are."""
+    """The first few names and the number of the others, for a message."""
     shown = ", ".join(names[:limit])
     return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"

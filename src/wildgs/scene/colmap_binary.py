@@ -1,4 +1,4 @@
-"""COLMAP's binary model files; counts are compared with the bytes that are there before memory is taken."""
+"""COLMAP's binary model files; declared counts are checked against the file size before memory is allocated."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def read_binary(folder: Path) -> ModelRecords:
     """Reads cameras.bin, images.bin and points3D.bin.
 
     Raises:
-        ModelFileError: One of them is truncated, too large, or no such file.
+        ModelFileError: A file is truncated, too large or invalid.
     """
     return ModelRecords(
         _read_cameras(_Bytes(folder / "cameras.bin")),
@@ -41,7 +41,7 @@ def read_binary(folder: Path) -> ModelRecords:
 
 
 class _Bytes:
-    """A file's bytes and a position that never leaves them."""
+    """Bounds-checked reading of a file."""
 
     def __init__(self, path: Path) -> None:
         size = path.stat().st_size
@@ -58,7 +58,7 @@ class _Bytes:
         return values
 
     def count(self, least_bytes: int) -> int:
-        """A declared number of records, each of at least so many bytes."""
+        """Reads a number of records of at least `least_bytes` each."""
         (number,) = self.take(_COUNT)
         self._need(number * least_bytes)
         return number
@@ -77,10 +77,10 @@ class _Bytes:
     def text(self) -> str:
         end = self.data.find(b"\0", self.position, self.position + MAX_NAME_BYTES)
         if end < 0:
-            raise ModelFileError(f"{self.name}: a name without an end at byte {self.position}")
+            raise ModelFileError(f"{self.name}: an unterminated name at byte {self.position}")
         raw = self.data[self.position : end]
         self.position = end + 1
-        # Photos named in another encoding are found under the bytes that the disk has.
+        # Names in other encodings are preserved as bytes.
         return raw.decode("utf-8", errors="surrogateescape")
 
     def finish(self) -> None:
@@ -90,8 +90,8 @@ class _Bytes:
     def _need(self, size: int) -> None:
         if size > len(self.data) - self.position:
             raise ModelFileError(
-                f"{self.name}: {size} bytes declared at byte {self.position}, "
-                f"{len(self.data) - self.position} are there"
+                f"{self.name}: {size} bytes declared at byte {self.position}, but only "
+                f"{len(self.data) - self.position} left"
             )
 
 

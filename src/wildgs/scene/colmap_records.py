@@ -1,8 +1,7 @@
-"""Records of a COLMAP model, and what its two formats share: nothing in a file is trusted.
+"""Records of a COLMAP model, for the readers of both formats, which validate all data.
 
-COLMAP's own reader is C++ and trusts the counts that a file declares: a damaged or malicious file can crash the
-process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". Observations (points2D) are passed
-over, because nothing here needs them.
+COLMAP's own reader trusts the counts that a file declares, so that a damaged or malicious file can crash the
+process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". Image points (points2D) are skipped.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ MAX_CAMERA_SIDE = 10**6
 
 
 class ModelFileError(Exception):
-    """An invalid model file; the message says where and why."""
+    """An invalid model file; the message gives the location and the reason."""
 
 
 @dataclass(frozen=True)
 class ImageRecord:
-    """A photo's pose as stored: world to camera."""
+    """A photo's pose as stored (world to camera)."""
 
     image_id: int
     quat: tuple[float, float, float, float]
@@ -37,13 +36,13 @@ class ImageRecord:
 
 @dataclass
 class PointRecords:
-    """Sparse points and which photos see them, in the order of the points' ids.
+    """Sparse points and their tracks, sorted by id.
 
     Attributes:
         xyz: Positions.
         rgb: Colours.
-        track_point: For each observation the point's row.
-        track_image: For each observation the photo's id.
+        track_point: Index of the point of each observation.
+        track_image: Id of the photo of each observation.
     """
 
     xyz: Float64[np.ndarray, "P 3"]
@@ -54,11 +53,11 @@ class PointRecords:
 
 @dataclass
 class ModelRecords:
-    """All of a model.
+    """The content of a model.
 
     Attributes:
         cameras: pycolmap's cameras by id.
-        images: Photos in the file's order.
+        images: Photos, in the order of the file.
         points: Points.
     """
 
@@ -69,7 +68,7 @@ class ModelRecords:
 
 @dataclass
 class PointList:
-    """Points as they are read, before they are put in order."""
+    """Points in the order of the file."""
 
     ids: list[int] = field(default_factory=list)
     xyz: list[tuple[float, ...]] = field(default_factory=list)
@@ -77,13 +76,13 @@ class PointList:
     tracks: list[np.ndarray] = field(default_factory=list)
 
     def sorted(self, where: str) -> PointRecords:
-        """The points by id, with their tracks joined.
+        """Sorts the points by id and concatenates their tracks.
 
         Raises:
-            ModelFileError: Two points have one id.
+            ModelFileError: Two points have the same id.
         """
         if len(set(self.ids)) != len(self.ids):
-            raise ModelFileError(f"{where}: two points have one id")
+            raise ModelFileError(f"{where}: two points have the same id")
         order = np.argsort(np.array(self.ids, dtype=np.uint64), kind="stable")
         tracks = [self.tracks[index] for index in order]
         lengths = np.array([len(track) for track in tracks], dtype=np.int64)
@@ -98,7 +97,7 @@ class PointList:
 
 @functools.cache
 def camera_models() -> dict[int, tuple[str, int]]:
-    """Camera models by id: name and number of parameters, as this pycolmap knows them."""
+    """Name and number of parameters of the camera models of this version of pycolmap, by id."""
     models = {}
     for name, kind in pycolmap.CameraModelId.__members__.items():
         if int(kind) >= 0:
@@ -108,10 +107,10 @@ def camera_models() -> dict[int, tuple[str, int]]:
 
 
 def make_camera(where: str, camera_id: int, model: str, width: int, height: int, params: list[float]) -> Any:
-    """A camera as pycolmap has it, from numbers out of a file.
+    """Creates a pycolmap camera from values in a file.
 
     Raises:
-        ModelFileError: It has no area, is too large, or its parameters are not its model's.
+        ModelFileError: The size or the parameters are invalid.
     """
     if not (0 < width <= MAX_CAMERA_SIDE and 0 < height <= MAX_CAMERA_SIDE):
         raise ModelFileError(f"{where}: camera {camera_id} is {width}x{height} pixels")
@@ -119,7 +118,7 @@ def make_camera(where: str, camera_id: int, model: str, width: int, height: int,
         return pycolmap.Camera(
             camera_id=camera_id, model=model, width=width, height=height, params=np.array(params)
         )
-    except Exception as error:  # pycolmap raises many kinds
+    except Exception as error:  # pycolmap raises many types
         raise ModelFileError(
             f"{where}: camera {camera_id} has parameters that are invalid for model {model}"
         ) from error

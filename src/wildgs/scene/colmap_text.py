@@ -29,7 +29,7 @@ def read_text(folder: Path) -> ModelRecords:
     """Reads cameras.txt, images.txt and points3D.txt.
 
     Raises:
-        ModelFileError: One of them is too large, or no such file.
+        ModelFileError: A file is too large or invalid.
     """
     return ModelRecords(
         _read_cameras(folder / "cameras.txt"),
@@ -39,20 +39,20 @@ def read_text(folder: Path) -> ModelRecords:
 
 
 def _check_count(path: Path, found: int) -> None:
-    """Warns where a file's own comment counts more than it holds: nothing else tells that a text was cut off."""
+    """Warns if a file's comment declares more entries than it has, the only sign of a truncated text file."""
     with path.open(encoding="utf-8", errors="replace") as file:
         head = "".join(line for line in itertools.islice(file, 5) if line.startswith("#"))
     declared = re.search(r"Number of \w+: (\d{1,12})", head)
     if declared is not None and int(declared[1]) > found:
         warnings.warn(
-            f"{path}: its comment declares {declared[1]} entries, and {found} are there; it may have been cut off",
+            f"{path}: its comment declares {declared[1]} entries, but it has {found}; it may be truncated",
             WildGSWarning,
             stacklevel=2,
         )
 
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[str, str]]:
-    """(place, line) of all lines that are no comments; bytes that are no UTF-8 stay as they are."""
+    """Yields (location, line) of all lines except comments; bytes that are not UTF-8 are preserved."""
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ModelFileError(f"{path.name}: larger than the limit of {MAX_FILE_BYTES} bytes")
     with path.open(encoding="utf-8", errors="surrogateescape") as file:
@@ -68,7 +68,7 @@ def _numbers(where: str, kind: type, texts: list[str], least: int) -> list[Any]:
     except (ValueError, OverflowError) as error:
         raise ModelFileError(f"{where}: {str(error)[:80]}") from error
     if len(values) < least:
-        raise ModelFileError(f"{where}: {len(values)} numbers where {least} are needed")
+        raise ModelFileError(f"{where}: {len(values)} numbers instead of at least {least}")
     if kind is int and any(not 0 <= value < 2**64 for value in values):
         raise ModelFileError(f"{where}: a number out of range")
     return values
@@ -80,7 +80,7 @@ def _read_cameras(path: Path) -> dict[int, Any]:
     for where, line in _lines(path):
         fields = line.split()
         if len(fields) < 4 or fields[1] not in lengths:
-            raise ModelFileError(f"{where}: no camera of a known model")
+            raise ModelFileError(f"{where}: an unknown camera model")
         camera_id, width, height = _numbers(where, int, [fields[0], *fields[2:4]], 3)
         params = _numbers(where, float, fields[4:], lengths[fields[1]])
         if len(params) != lengths[fields[1]]:
@@ -91,7 +91,7 @@ def _read_cameras(path: Path) -> dict[int, Any]:
 
 
 def _read_images(path: Path) -> list[ImageRecord]:
-    """Two lines a photo; the second, its observations, may be empty."""
+    """Reads two lines per photo; the second one, its image points, may be empty."""
     images = []
     lines = _lines(path, keep_empty=True)
     for where, line in lines:
@@ -99,7 +99,7 @@ def _read_images(path: Path) -> list[ImageRecord]:
             continue
         fields = line.split(maxsplit=9)
         if len(fields) < 10:
-            raise ModelFileError(f"{where}: {len(fields)} fields where a photo has 10")
+            raise ModelFileError(f"{where}: {len(fields)} fields instead of 10")
         image_id, camera_id = _numbers(where, int, [fields[0], fields[8]], 2)
         pose = _numbers(where, float, fields[1:8], 7)
         if len(fields[9].encode(errors="surrogateescape")) > MAX_NAME_BYTES:

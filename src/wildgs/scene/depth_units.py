@@ -1,4 +1,4 @@
-"""Checks that metric depth is in the units of the model that it belongs to."""
+"""Checks that metric depth maps are in the units of the COLMAP model."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from wildgs.scene.scene import Scene, View
 
 _PHOTOS, _LEAST_POINTS = 20, 10
 _MOST = 1.25
-"""Factor by which metric depth and the points of a model may differ over all photos."""
+"""Largest median ratio between metric depth and the depth of the model's points."""
 
 
 def refuse_other_units(scene: Scene) -> None:
-    """Compares metric depth with the points that photos observe: Gaussians begin, and are held, where it says.
+    """Compares metric depth with the depth of the points that photos observe.
 
     Raises:
-        UserError: It is of a model that was replaced since, or in metres where the model is not.
+        UserError: The depth maps were made for another model, or have other units.
     """
     if next((scene.root / "depth").rglob("*.tiff"), None) is None:
         return
@@ -28,14 +28,14 @@ def refuse_other_units(scene: Scene) -> None:
     usual = float(torch.tensor(ratios).median())
     if not 1 / _MOST <= usual <= _MOST:
         raise UserError(
-            f"{scene.root / 'depth'}: metric depth (.tiff) is {usual:.3g} times as large as that of the model's "
-            f"points, so it is in other units or of another model: divide it by {usual:.3g}, or delete these files "
-            "and run `wildgs depth --by stereo`"
+            f"{scene.root / 'depth'}: metric depth (.tiff) is {usual:.3g} times the depth of the model's points; "
+            f"it has other units or belongs to another model: divide it by {usual:.3g}, or delete these files and "
+            "run `wildgs depth --by stereo`"
         )
 
 
 def _ratio(scene: Scene, row: int, view: View) -> float | None:
-    """Median of metric depth over the depth of points; None where too few points have both."""
+    """Median ratio of metric depth to the depth of points; None if too few points have both."""
     depth = view.read_depth()
     if depth is None:
         return None
@@ -45,5 +45,5 @@ def _ratio(scene: Scene, row: int, view: View) -> float | None:
     inside = (z > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
     x, y = pixels[inside].long().unbind(dim=1)
     found, z = depth[y, x], z[inside]
-    known = found > 0
-    return float((found[known] / z[known]).median()) if int(known.sum()) >= _LEAST_POINTS else None
+    valid = found > 0
+    return float((found[valid] / z[valid]).median()) if int(valid.sum()) >= _LEAST_POINTS else None

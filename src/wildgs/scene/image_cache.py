@@ -1,8 +1,8 @@
-"""Decoded photos within a byte limit, the rest decoded again in background threads before they are needed.
+"""Cache of decoded photos with a memory limit; other photos are decoded in background threads before their use.
 
-Photos train in shuffled rounds, so a photo's next turn is about a round away: a cache that throws out what was
-used longest ago would throw out nearly everything just before its turn. Here the first photos that fit stay for
-good, and a small window holds the others around their turn: hits are as many as the limit allows.
+Photos are trained in shuffled epochs, so that a least-recently-used cache would evict nearly every photo just
+before its next use. Instead, the first photos that fit are kept permanently, and a small window holds the others
+around their use, which gives the largest possible hit rate.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from wildgs.processes import local_world_size
 from wildgs.scene.images import Photo
 
 DECODERS = 4
-"""Threads that decode photos; Pillow works without Python's lock."""
+"""Number of threads that decode photos; Pillow releases the GIL."""
 
 AHEAD = 4
-"""Photos that are decoded before their turn."""
+"""Number of photos that are decoded in advance."""
 
 _WINDOW = AHEAD + 2
 
 
 class ImageCache:
-    """Keeps decoded photos; safe to use from several threads.
+    """A thread-safe cache of decoded photos.
 
     Attributes:
-        limit: Bytes; the last few photos are kept even if they exceed it.
-        decoded: How many photos were decoded again so far.
+        limit: Memory limit in bytes; the last few photos are kept even if they exceed it.
+        decoded: Number of cache misses so far.
     """
 
     def __init__(self, limit: int) -> None:
@@ -48,11 +48,11 @@ class ImageCache:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes of all photos held now."""
+        """Memory of all cached photos, bytes."""
         return self._kept_bytes + self._recent_bytes
 
     def put(self, name: str, photo: Photo, *, keep: bool = True) -> None:
-        """Adds a decoded photo; with `keep` it may stay, as photos that train do."""
+        """Adds a decoded photo; with `keep`, as for training photos, it may be kept permanently."""
         size = photo.num_bytes
         with self._lock:
             if name in self._kept or name in self._recent:
@@ -69,7 +69,7 @@ class ImageCache:
                 self._recent_bytes -= old.num_bytes
 
     def get(self, name: str, load: Callable[[], Photo]) -> Photo:
-        """A photo from the cache or from the background thread that decodes it, or else decoded now by `load`."""
+        """A photo from the cache or a background thread, else decoded now by `load`."""
         with self._lock:
             if name in self._kept:
                 return self._kept[name]
@@ -80,7 +80,7 @@ class ImageCache:
         return pending.result() if pending is not None else self._decode(name, load)
 
     def prefetch(self, name: str, load: Callable[[], Photo]) -> None:
-        """Starts decoding in the background, unless the photo is here or on its way."""
+        """Starts decoding in the background unless the photo is cached or being decoded."""
         with self._lock:
             if name in self._kept or name in self._recent or name in self._pending:
                 return
@@ -100,9 +100,9 @@ class ImageCache:
 
 
 def available_memory() -> int | None:
-    """Bytes that a process can still take without swapping; None where the system does not say.
+    """Available memory of this process in bytes; None if unknown.
 
-    Processes that torchrun started on this machine get equal shares.
+    The memory is divided equally among torchrun's processes on this machine.
     """
     found = []
     try:
@@ -111,7 +111,7 @@ def available_memory() -> int | None:
                 found.append(int(line.split()[1]) * 1024)
     except (OSError, ValueError):
         pass
-    try:  # a container's own limit (cgroup v2)
+    try:  # a container's limit (cgroup v2)
         group = Path("/sys/fs/cgroup")
         maximum = (group / "memory.max").read_text(encoding="ascii").strip()
         if maximum != "max":

@@ -1,6 +1,6 @@
-"""Pictures from disk as 8-bit arrays, of any mode and orientation; broken files raise an error that says why.
+"""Reading images of any mode and orientation as arrays; errors give the reason.
 
-Colours stay in the photo's own encoding (sRGB as a rule), as every photo collection of the field uses them.
+Colours keep the photo's encoding, usually sRGB.
 """
 
 from __future__ import annotations
@@ -28,37 +28,38 @@ TRANSPOSITIONS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What makes a picture upright, by its EXIF orientation."""
+"""Transposition for each EXIF orientation that makes an image upright."""
 ASPECT_TOLERANCE = 0.01
-"""Sizes have the same shape when their aspects differ by less than this share (or a pixel's rounding)."""
+"""Largest relative difference between aspect ratios of sizes with the same shape (besides rounding to pixels)."""
 
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000", "AVIF", "HEIF")
-"""What is decoded, whatever a file's name says. Others that Pillow knows start programs (EPS runs Ghostscript)."""
+"""Formats that are decoded, whatever the file's extension. Some others of Pillow start programs (EPS:
+Ghostscript)."""
 
 DECODING_PIXELS = 100_000_000
-"""Pixels that all threads decode at the same time; a larger picture waits for the others."""
+"""Upper bound on the number of pixels that all threads decode at the same time."""
 
 _open_lock = threading.Lock()
 
 
 class UnreadableImageError(Exception):
-    """A picture that cannot be used; the message says why, without the file's name."""
+    """An image cannot be used; the message gives the reason without the file's name."""
 
 
 class ShapeMismatchError(UnreadableImageError):
-    """A picture whose shape is not its camera's: the file is valid, the scene is inconsistent."""
+    """A valid image whose aspect ratio differs from that of its camera."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A decoded photo. Shared between readers: its arrays are not to be written to.
+    """A decoded photo, shared between readers: its arrays must not be modified.
 
     Attributes:
-        pixels: Colours, 8 bits; black where the photo is fully transparent.
-        mask: 0 = ignore (transparent, outside the lens's picture, or the user's own mask), 255 = use; None where
-            nothing is ignored.
-        disparity: Depth prior, 16 bits, large = near, 0 = no estimate; None where there is none.
-        depth: Metric depth along the camera's axis in the scene's units, 0 = no estimate; None where there is none.
+        pixels: Colours, 8 bits; black if fully transparent.
+        mask: 0 = ignore (transparent, outside the undistorted image, or by the user's mask), 255 = use; None if no
+            pixel is ignored.
+        disparity: Disparity map, 16 bits, large = near, 0 = no estimate; None if there is none.
+        depth: Metric depth along the camera's z axis in units of the scene, 0 = no estimate; None if there is none.
     """
 
     pixels: UInt8[np.ndarray, "H W 3"]
@@ -68,13 +69,13 @@ class Photo:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of its arrays."""
+        """Memory of the arrays, bytes."""
         arrays = (self.pixels, self.mask, self.disparity, self.depth)
         return sum(array.nbytes for array in arrays if array is not None)
 
 
 class _DecodingBudget:
-    """Shares `DECODING_PIXELS` among threads; a thread that has a share may decode further pictures under it."""
+    """Divides `DECODING_PIXELS` among threads; a thread that holds a share may decode further images within it."""
 
     def __init__(self) -> None:
         self._taken = 0
@@ -104,22 +105,22 @@ _budget = _DecodingBudget()
 
 
 def decoding(image: Image.Image) -> AbstractContextManager[None]:
-    """Waits until the picture may be decoded: memory for pixels is bounded over all threads in such blocks.
+    """Waits until the image may be decoded, to limit the memory of all threads in such blocks.
 
-    The functions of this module do this themselves; callers that hold several copies of the pixels do it, too.
+    The functions of this module use it; callers that hold several copies of the pixels should use it, too.
     """
     return _budget.share(image.width * image.height)
 
 
 def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
-    """Open a picture and read its header only.
+    """Opens an image and reads its header only.
 
     Raises:
-        UnreadableImageError: It is missing, no picture, or has more pixels than `max_pixels`.
+        UnreadableImageError: The file is missing, not an image, or has more pixels than `max_pixels`.
     """
     try:
         check_regular(path)
-        # Pillow's own limit is a global of the process, and warns; ours is an argument.
+        # Disables Pillow's global limit, which only warns, in favour of `max_pixels`.
         with _open_lock:
             previous, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
@@ -129,12 +130,12 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
     except FileNotFoundError as error:
         raise UnreadableImageError("no such file") from error
     except UnidentifiedImageError as error:
-        raise UnreadableImageError("not a readable picture") from error
-    except OSError as error:  # no permission, a pipe or device, a name that is too long
+        raise UnreadableImageError("not a readable image") from error
+    except OSError as error:  # missing permission, a pipe or device, a name that is too long
         reason = error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UnreadableImageError(reason) from error
-    except Exception as error:  # Pillow's plugins raise nearly anything on broken headers
-        raise UnreadableImageError("not a readable picture") from error
+    except Exception as error:  # Pillow's plugins raise many types for invalid headers
+        raise UnreadableImageError("not a readable image") from error
     width, height = image.size
     if width * height == 0:
         image.close()
@@ -148,7 +149,7 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
 
 
 def _formats() -> list[str]:
-    """Those of `FORMATS` that this Pillow can read."""
+    """The members of `FORMATS` that this version of Pillow can read."""
     Image.init()
     return [name for name in FORMATS if name in Image.OPEN]
 
@@ -162,30 +163,32 @@ def _load(image: Image.Image) -> None:
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:
-    """Width and height once the EXIF orientation is applied, from the header alone."""
+    """Width and height after applying the EXIF orientation, from the header only."""
     width, height = image.size
-    turned = _orientation(image) in (5, 6, 7, 8) and image.format != "TIFF"  # Pillow turns those itself
+    turned = (
+        _orientation(image) in (5, 6, 7, 8) and image.format != "TIFF"
+    )  # Pillow rotates TIFF files itself
     return (height, width) if turned else (width, height)
 
 
 def _orientation(image: Image.Image) -> int:
     try:
         return int(image.getexif().get(EXIF_ORIENTATION, 1))
-    except Exception:  # a broken EXIF block does not make the pixels worse
+    except Exception:  # invalid EXIF data is ignored
         return 1
 
 
 def _upright(image: Image.Image) -> Image.Image:
-    """The loaded picture with its EXIF orientation applied.
+    """The loaded image with its EXIF orientation applied.
 
-    `ImageOps.exif_transpose` also rewrites the EXIF block, which fails on blocks with odd entries.
+    `ImageOps.exif_transpose` also rewrites the EXIF data, which fails for unusual entries.
     """
     method = TRANSPOSITIONS.get(_orientation(image))
     return image if method is None else image.transpose(method)
 
 
 def same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) are the same picture at other resolutions."""
+    """Whether two sizes (width, height) have the same aspect ratio."""
     scale_x, scale_y = a[0] / b[0], a[1] / b[1]
     tolerance = max(ASPECT_TOLERANCE, 1.0 / min(*a, *b))
     return abs(scale_x / scale_y - 1.0) <= tolerance
@@ -198,19 +201,19 @@ def read_photo(
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_IMAGE_PIXELS,
 ) -> Photo:
-    """Decode a photo to 8-bit RGB.
+    """Decodes a photo to 8-bit RGB.
 
-    COLMAP reads pixels as they are stored and ignores the EXIF orientation, so with `camera_size` the stored
-    grid counts, unless only the upright one has the camera's shape. Without it the photo is turned upright.
+    COLMAP ignores the EXIF orientation, so with `camera_size` the photo is not rotated, unless only the rotated
+    photo has the camera's aspect ratio. Without `camera_size` the photo is rotated upright.
 
     Args:
         path: The file: RGB, grey, CMYK, palette, alpha, 8 or 16 bits.
         camera_size: Width and height of the photo's camera.
         size: Width and height to resize to (Lanczos, antialiased); None keeps the size.
-        max_pixels: Larger pictures are refused.
+        max_pixels: Larger images are rejected.
 
     Raises:
-        UnreadableImageError: The file cannot be decoded, or has another shape than its camera.
+        UnreadableImageError: The file cannot be decoded, or its aspect ratio differs from that of the camera.
     """
     with open_image(path, max_pixels) as image, decoding(image):
         turn = _orientation(image) != 1
@@ -232,12 +235,12 @@ def read_photo(
 def read_mask(
     path: Path, size: tuple[int, int], max_pixels: int = MAX_IMAGE_PIXELS
 ) -> UInt8[np.ndarray, "H W"]:
-    """Decode a mask: 0 where the file is black (ignored), 255 elsewhere; by majority where it is shrunk.
+    """Decodes a mask: 0 where the file is black (ignored), 255 elsewhere; by majority if it is reduced.
 
-    JPEG files, whose black is only nearly so, are cut at half brightness.
+    JPEG files, in which black is not exact, are thresholded at half brightness.
 
     Raises:
-        UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
+        UnreadableImageError: The file cannot be decoded, or has another aspect ratio than `size`.
     """
     with open_image(path, max_pixels) as image, decoding(image):
         _check_shape(image, size)
@@ -249,12 +252,12 @@ def read_mask(
 def read_disparity(
     path: Path, size: tuple[int, int], max_pixels: int = MAX_IMAGE_PIXELS
 ) -> UInt16[np.ndarray, "H W"]:
-    """Decode a disparity map (large = near, 0 = no estimate) to 16 bits; 8-bit files are stretched.
+    """Decodes a disparity map (large = near, 0 = no estimate) to 16 bits; 8-bit files are scaled.
 
-    Zeros are no values: they take no part in the mean of the pixels that a smaller pixel covers.
+    When the map is reduced, zeros are excluded from the means.
 
     Raises:
-        UnreadableImageError: The file cannot be decoded, or has another shape than `size`.
+        UnreadableImageError: The file cannot be decoded, or has another aspect ratio than `size`.
     """
     with open_image(path, max_pixels) as image, decoding(image):
         _check_shape(image, size)
@@ -274,18 +277,18 @@ def read_disparity(
 def read_depth(
     path: Path, size: tuple[int, int], max_pixels: int = MAX_IMAGE_PIXELS
 ) -> Float32[np.ndarray, "H W"]:
-    """Decode a metric depth map (32-bit floats, 0 = no estimate).
+    """Decodes a metric depth map (32-bit floats, 0 = no estimate).
 
-    A smaller pixel takes the nearest one's value: a mean over an edge would lie where there is nothing.
+    The map is resized by nearest neighbour, since means across depth edges are wrong.
 
     Raises:
-        UnreadableImageError: The file cannot be decoded, holds other numbers, or has another shape than `size`.
+        UnreadableImageError: The file cannot be decoded, is not float, or has another aspect ratio than `size`.
     """
     with open_image(path, max_pixels) as image, decoding(image):
         _check_shape(image, size)
         _load(image)
         if image.mode != "F":
-            raise UnreadableImageError("metric depth has 32-bit floats, one channel")
+            raise UnreadableImageError("metric depth must be one channel of 32-bit floats")
         values = np.asarray(image.resize(size, Image.Resampling.NEAREST), dtype=np.float32)
     return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
 
@@ -293,7 +296,7 @@ def read_depth(
 def _check_shape(image: Image.Image, size: tuple[int, int]) -> None:
     if not same_shape(image.size, size):
         raise ShapeMismatchError(
-            f"{_times(image.size)} pixels do not have the shape of the photo, {_times(size)}"
+            f"its size {_times(image.size)} has another aspect ratio than the photo, {_times(size)}"
         )
 
 
@@ -302,14 +305,14 @@ def _times(size: tuple[int, int]) -> str:
 
 
 def _to_grey(image: Image.Image) -> Image.Image:
-    """One channel: as it is where it has more than 8 bits, else the luminance."""
+    """One channel: unchanged if it has more than 8 bits, else the luminance."""
     if _is_deep(image):
         return image
     try:
         return image.convert("L")
-    except ValueError as error:  # Pillow converts some modes (LAB) to nothing but RGB, or not at all
+    except ValueError as error:  # Pillow converts some modes (LAB) to RGB only, or not at all
         raise UnreadableImageError(
-            f"its colour mode {image.mode} is not supported; save it as grey"
+            f"its colour mode {image.mode} is not supported; save it as greyscale"
         ) from error
 
 
@@ -318,7 +321,7 @@ def _is_deep(image: Image.Image) -> bool:
 
 
 def _to_rgb(image: Image.Image) -> tuple[Image.Image, UInt8[np.ndarray, "H W"] | None]:
-    """Colours, black under full transparency, and the alpha channel if the picture has one."""
+    """Colours, black if fully transparent, and the alpha channel if there is one."""
     if _is_deep(image):
         return Image.fromarray(_to_8_bits(np.asarray(image))).convert("RGB"), None
     has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
@@ -330,7 +333,7 @@ def _to_rgb(image: Image.Image) -> tuple[Image.Image, UInt8[np.ndarray, "H W"] |
 
 
 def _to_8_bits(values: Shaped[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
-    """Grey of more than 8 bits: 16-bit integers, or floats in [0, 1]."""
+    """Converts 16-bit integers or floats in [0, 1] to 8 bits."""
     full = 1.0 if values.dtype.kind == "f" else 65535.0
     values = np.nan_to_num(values, nan=0.0)
     return np.clip(np.round(values.astype(np.float64) * (255.0 / full)), 0, 255).astype(np.uint8)
@@ -341,7 +344,7 @@ def _resize(image: Image.Image, size: tuple[int, int] | None, resampling: Image.
 
 
 def _resize_mask(mask: Shaped[np.ndarray, "h w"], size: tuple[int, int] | None) -> UInt8[np.ndarray, "H W"]:
-    """0 or 255 per pixel of the new size, by the majority of the pixels beneath."""
+    """Resizes a mask to values 0 and 255 by majority."""
     binary = Image.fromarray(np.where(mask != 0, 255, 0).astype(np.uint8))
     resized = np.asarray(_resize(binary, size, Image.Resampling.BOX))
     return np.where(resized >= 128, 255, 0).astype(np.uint8)

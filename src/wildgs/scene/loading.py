@@ -1,4 +1,4 @@
-"""`load_scene`: a scene folder becomes views with cameras in the aligned frame."""
+"""`load_scene`: reads a scene folder as views with cameras in the aligned frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from wildgs.scene.split import assign_splits
 from wildgs.scene.undistort import PixelGrid
 
 CACHE_SHARE = 0.5
-"""Share of the free memory that decoded photos take at most, whatever the limit."""
+"""Largest fraction of the free memory for decoded photos, whatever the configured limit."""
 
 
 def load_scene(
@@ -36,27 +36,26 @@ def load_scene(
     image_cache: str = IMAGE_CACHE,
     progress: Counter | None = None,
 ) -> Scene:
-    """Read a COLMAP scene: cameras, points, split, photos (8 bits, within `image_cache`), masks, depth.
+    """Reads a COLMAP scene: cameras, points, split, photos, masks and depth maps.
 
-    Every photo is decoded once, so that broken ones are known before training begins.
+    Every photo is decoded once, so that unreadable ones are found before training.
 
     Args:
         root: Folder with `images/` and `sparse/0/` (or `sparse/`, `dense/sparse/`), optionally a `*.tsv`
             split, `masks/`, `depth/` and `truth/`.
-        config: Size, split and limits; the defaults where None.
-        alignment: From the model's frame to the scene's; None computes it from the model. Runs give their own, so
-            that their Gaussians fit whatever has become of the model.
-        lazy: Decode photos only when they are asked for, and keep the last few: for tools that look at some of
-            them. A photo that cannot be read is then no reason to leave its view out.
-        image_cache: Memory for decoded photos, such as 4GB; without influence on what is read.
-        progress: Called with (photos read, photos in all) as photos are decoded.
+        config: Size, split and limits; None for the defaults.
+        alignment: Transform from the model's frame to the aligned frame; None computes it from the model. For a
+            run, its own alignment, to which its Gaussians belong.
+        lazy: Decode photos on demand and keep only the last few. Views of unreadable photos are then not left out.
+        image_cache: Memory for decoded photos, such as 4GB.
+        progress: Called with (photos read, total number of photos).
 
     Returns:
-        The scene in its aligned frame (+z up, median depth 1).
+        The scene in the aligned frame (+z up, median depth of the photos = 1).
 
     Raises:
-        UserError: There is no model, point, readable photo or photo to train on, or a file has the wrong
-            shape.
+        UserError: There is no model, no point, no readable photo or no training photo, or a file has a wrong aspect
+            ratio.
     """
     root, config = Path(root), config or DataConfig()
     model = read_model(root)
@@ -97,11 +96,11 @@ def load_scene(
 
 
 def _report_unused(photos: ScenePhotos) -> None:
-    """Warns of masks and depth priors that are named after no photo."""
+    """Warns of masks and depth maps whose names match no photo."""
     for folder, used in (("masks", photos.use_masks), ("depth", photos.use_depth)):
         if used and (names := photos.unused(folder)):
             warnings.warn(
-                f"{photos.root / folder}: {len(names)} files are named after no photo and are not used: "
+                f"{photos.root / folder}: {len(names)} files match no photo by name and are not used: "
                 f"{describe_names(names)}; the file of a.jpg is {'a.jpg.png or ' * (folder == 'masks')}a.png",
                 WildGSWarning,
                 stacklevel=3,
@@ -109,19 +108,19 @@ def _report_unused(photos: ScenePhotos) -> None:
 
 
 def _report_blank(views: Sequence[View], photos: ScenePhotos) -> None:
-    """Warns of photos that train with no pixel: a mask whose black and white are exchanged."""
+    """Warns of training photos that are masked completely, for example by an inverted mask."""
     blank = [view.name for view in views if view.split == "train" and view.name in photos.blank]
     if blank:
         warnings.warn(
-            f"{len(blank)} photos are masked completely, so nothing is learned from them: "
-            f"{describe_names(blank)}; in masks, 0 is what is ignored",
+            f"{len(blank)} training photos are masked completely and have no effect: "
+            f"{describe_names(blank)}; in masks, 0 = ignore the pixel",
             WildGSWarning,
             stacklevel=3,
         )
 
 
 def _unit_camera(image: ColmapImage) -> Camera:
-    """The photo's pose; alignment looks at nothing else."""
+    """A camera with the photo's pose, for the alignment."""
     return Camera(viewmat=image.viewmat, K=torch.eye(3, dtype=torch.float64), width=1, height=1)
 
 
@@ -134,7 +133,7 @@ def _load_views(
     lazy: bool,
     progress: Counter | None,
 ) -> tuple[list[View], list[tuple[str, str]]]:
-    """Views in the order of their names, and (name, reason) of the photos that cannot be read."""
+    """Views sorted by name, and (name, reason) of the photos that cannot be read."""
     views: list[View] = []
     broken: list[tuple[str, str]] = []
 
@@ -164,7 +163,7 @@ def _cache_limit(image_cache: str) -> int:
 
 
 def _pixel_grid(image: ColmapImage, config: DataConfig) -> PixelGrid:
-    """From the stored photo's pixels to the view's."""
+    """The mapping from the stored photo's pixels to those of the view."""
     if image.camera.is_spherical():
         raise UserError(f"{image.name}: spherical cameras ({image.camera.model_name}) are not supported")
     size = (image.camera.width, image.camera.height)
@@ -181,10 +180,10 @@ def _pixel_grid(image: ColmapImage, config: DataConfig) -> PixelGrid:
 
 
 def _report_broken(broken: Sequence[tuple[str, str]], views: Sequence[View], images_dir: Path) -> None:
-    """Name the photos left out; stop where no photo is left to train."""
+    """Warns of unreadable photos; raises `UserError` if no training photo is left."""
     described = describe_names([f"{name} ({reason})" for name, reason in broken])
     if not any(view.split == "train" for view in views):
-        raise UserError(f"{images_dir}: no photo to train can be read: {described}")
+        raise UserError(f"{images_dir}: no training photo can be read: {described}")
     if broken:
         warnings.warn(
             f"{len(broken)} photos in {images_dir} cannot be read and are left out: {described}",

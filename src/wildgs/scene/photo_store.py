@@ -1,4 +1,4 @@
-"""Stores of photos: a view's pixels, mask and depth prior, decoded when they are needed."""
+"""Photo stores: pixels, mask and depth maps of views, decoded on demand."""
 
 from __future__ import annotations
 
@@ -38,15 +38,19 @@ _Values = TypeVar("_Values", bound=np.ndarray)
 
 
 def with_ending(name: str, ending: str) -> str:
-    """A photo's name with another ending, sub-folders kept."""
+    """A photo's name, including sub-folders, with another extension."""
     return str(PurePosixPath(name).with_suffix(ending))
 
 
 def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The files of the disparity of a scene's photos, by the names of all photos of its model.
+    """Paths of the disparity maps of a scene's photos.
 
-    `depth/<stem>.png`, sub-folders kept; photos that differ by their ending alone (`a.jpg` and `a.png`) have
-    `depth/<name>.png`, so that no two share a file.
+    `depth/<stem>.png`, including sub-folders; `depth/<name>.png` for photos whose names differ only in the
+    extension.
+
+    Args:
+        root: The scene folder.
+        names: All photos of the model.
     """
     names = list(names)
     shared = _shared_stems(names)
@@ -58,21 +62,21 @@ def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
 
 
 def metric_file(disparity: Path) -> Path:
-    """The file of a photo's metric depth, beside that of its disparity: 32-bit floats, units of the model."""
+    """Path of a photo's metric depth map (32-bit floats, units of the model) beside that of its disparity."""
     return disparity.with_suffix(".tiff")
 
 
 def _shared_stems(names: Iterable[str]) -> set[str]:
-    """Names without ending that several photos have."""
+    """Names without extension that several photos have."""
     counts = Counter(with_ending(name, "") for name in names)
     return {stem for stem, count in counts.items() if count > 1}
 
 
 class PhotoStore(ABC):
-    """Where the views of a scene read their photos, by name.
+    """A store from which the views of a scene read their photos.
 
     Attributes:
-        detail: Long side, in pixels, beyond which the photos hold no detail; None without such a limit.
+        detail: Longest side, in pixels, of the stored photos, which may be upsampled; None without limit.
     """
 
     detail: int | None = None
@@ -82,42 +86,42 @@ class PhotoStore(ABC):
         """A photo at the size of its view's camera.
 
         Raises:
-            UserError: It cannot be read.
+            UserError: The photo cannot be read.
         """
 
     def fingerprint(self, name: str) -> dict[str, str]:
-        """What tells a photo's files from others, by what they are; empty where there are no files."""
+        """Digests of a photo's files by their role; empty without files."""
         return {}
 
     def file(self, name: str) -> Path | None:
         """The file of a photo; None for stores without files."""
         return None
 
-    def prefetch(self, name: str) -> None:  # noqa: B027 - stores that need no preparation do nothing
+    def prefetch(self, name: str) -> None:  # noqa: B027 - does nothing by default
         """Announces that a photo is needed soon, so that it can be decoded in the background."""
 
     def read_clean(self, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The photo without its transients (only evaluation may look at it); None where there is none.
+        """The photo without transients (ground truth, for evaluation only); None if there is none.
 
         Raises:
-            UserError: The file is there and cannot be used.
+            UserError: The file exists but cannot be used.
         """
         return None
 
     def read_truth_mask(self, name: str) -> UInt8[np.ndarray, "H W"] | None:
-        """Where the photo shows the static scene (255) or a transient (0); None where that is not known.
+        """Ground truth mask: 255 = static, 0 = transient; None if there is none.
 
         Raises:
-            UserError: The file is there and cannot be used.
+            UserError: The file exists but cannot be used.
         """
         return None
 
 
 class ScenePhotos(PhotoStore):
-    """The photos of a scene folder with their masks and depth priors, decoded within a memory limit.
+    """The photos of a scene folder with masks and depth maps, in a cache of limited memory.
 
     Attributes:
-        blank: Photos whose every pixel is masked, of those that `load` has read.
+        blank: Photos read by `load` that are masked completely.
     """
 
     def __init__(
@@ -132,17 +136,17 @@ class ScenePhotos(PhotoStore):
         max_pixels: int = MAX_IMAGE_PIXELS,
         depth_scale: float = 1.0,
     ) -> None:
-        """Starts without photos, which `add` registers.
+        """Creates an empty store, to which `add` adds photos.
 
         Args:
-            root: The scene's folder.
-            images_dir: That of its photos.
+            root: The scene folder.
+            images_dir: The folder of the photos.
             names: All photos of the model.
-            cache: Keeps decoded photos.
+            cache: Cache of decoded photos.
             use_masks: Whether masks/ is read.
             use_depth: Whether depth/ is read.
-            max_pixels: Larger pictures are not read.
-            depth_scale: The scene's units in one of the model's.
+            max_pixels: Larger images are not read.
+            depth_scale: Factor from units of the model to units of the scene.
         """
         self.depth_scale = depth_scale
         self.root = root
@@ -158,15 +162,15 @@ class ScenePhotos(PhotoStore):
         self.blank: set[str] = set()
 
     def add(self, name: str, grid: PixelGrid) -> None:
-        """Registers a photo, by its path within the folder of photos."""
+        """Adds a photo by its path within the folder of photos."""
         self._grids[name] = grid
 
     def load(self, name: str, *, keep: bool) -> None:
-        """Decodes a photo for the first time; with `keep` it may stay in memory, as photos that train do.
+        """Decodes a photo for the first time; with `keep`, as for training photos, it may stay in memory.
 
         Raises:
-            UnreadableImageError: The photo itself cannot be decoded.
-            UserError: The photo has another shape than its camera, or its mask cannot be used.
+            UnreadableImageError: The photo cannot be decoded.
+            UserError: The photo has another aspect ratio than its camera, or its mask cannot be used.
         """
         photo = self._decode(name)
         if photo.mask is not None and not photo.mask.any():
@@ -178,12 +182,10 @@ class ScenePhotos(PhotoStore):
         try:
             return self.cache.get(name, lambda: self._decode(name))
         except UnreadableImageError as error:
-            raise UserError(
-                f"{self.images_dir / name}: {error}; put the photo back, or replace it"
-            ) from error
+            raise UserError(f"{self.images_dir / name}: {error}; restore or replace the photo") from error
 
     def fingerprint(self, name: str) -> dict[str, str]:
-        """See `PhotoStore.fingerprint`: of photo, mask and depth prior, so far as they are used."""
+        """See `PhotoStore.fingerprint`; for photo, mask and depth maps, as far as they are used."""
         files = {
             "content": self.images_dir / name,
             "mask": self.find_mask(name) if self.use_masks else None,
@@ -219,17 +221,17 @@ class ScenePhotos(PhotoStore):
         return None if path is None else self._read_mask(path, self._grids[name])
 
     def find_mask(self, name: str) -> Path | None:
-        """The user's mask: `masks/<name>.png` (as COLMAP), `masks/<name>`, or `masks/<stem>.png` if unambiguous."""
+        """The user's mask: `masks/<name>.png` (COLMAP), `masks/<name>`, or an unambiguous `masks/<stem>.png`."""
         stem = with_ending(name, "")
         candidates = [f"{name}.png", name, *([] if stem in self._shared else [f"{stem}.png"])]
         return self._find("masks", *candidates)
 
     def _find(self, folder: str, *names: str) -> Path | None:
-        """The first that is there; what is no regular file is found too, so that reading it says so."""
+        """The first existing path, even if it is not a regular file, which is reported when it is read."""
         return next((path for name in names if is_there(path := self.root / folder / name)), None)
 
     def unused(self, folder: str) -> list[str]:
-        """Files in `masks/` or `depth/` that belong to no photo of the scene's folder, by names relative to it."""
+        """Files in `masks/` or `depth/` that belong to no photo, by relative names."""
         files = [path for path in (self.root / folder).rglob("*") if not path.is_dir()]
         if not files:
             return []
@@ -254,11 +256,11 @@ class ScenePhotos(PhotoStore):
         return mask if source is None else sample_mask(mask, source)
 
     def _decode(self, name: str) -> Photo:
-        """Decodes a photo with what belongs to it.
+        """Decodes a photo with its mask and depth maps.
 
         Raises:
-            UnreadableImageError: The photo itself cannot be decoded.
-            UserError: The photo has another shape than its camera, or its mask cannot be used.
+            UnreadableImageError: The photo cannot be decoded.
+            UserError: The photo has another aspect ratio than its camera, or its mask cannot be used.
         """
         path, grid = self.images_dir / name, self._grids[name]
         try:
@@ -266,7 +268,7 @@ class ScenePhotos(PhotoStore):
                 path, camera_size=grid.camera_size, size=grid.resized, max_pixels=self.max_pixels
             )
         except ShapeMismatchError as error:
-            raise UserError(f"{path}: {error}; the photos must be those the model was made from") from error
+            raise UserError(f"{path}: {error}; use the photos from which the model was made") from error
         source = grid.source()
         pixels, masks = photo.pixels, []
         if photo.mask is not None:
@@ -299,7 +301,7 @@ class ScenePhotos(PhotoStore):
     def _read_prior(
         self, path: Path, grid: PixelGrid, read: Callable[[Path, tuple[int, int], int], _Values]
     ) -> _Values | None:
-        """A file of depth/; one that is missing or broken is looked for, and warned of, once."""
+        """Reads a file of depth/; searches for, and warns of, a missing or unreadable file only once."""
         if not self.use_depth or path in self._without_depth or not is_there(path):
             self._without_depth.add(path)
             return None

@@ -1,4 +1,4 @@
-"""Views and scenes: what training, evaluation and rendering read."""
+"""Views, scenes and their alignment."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from wildgs.scene.photo_store import PhotoStore
 
 Split = Literal["train", "test"]
 LEAST_PHOTOS = 3
-"""Photos that triangulate a point by which something static is proven."""
+"""Smallest number of photos in which a point is observed to be taken as static."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The rigid motion and scale from the input's (COLMAP's) frame to the scene's aligned frame.
+    """The similarity transform from the frame of the COLMAP model to the aligned frame.
 
-    ``aligned = scale * rotation @ input + translation``. Kept with the run so that exports can go back.
-    Double precision, because georeferenced input lies far from its origin.
+    ``aligned = scale * rotation @ input + translation``, in double precision, because georeferenced models may be
+    far from the origin.
     """
 
     rotation: Float[Tensor, "3 3"]
@@ -36,24 +36,24 @@ class Alignment:
 
     @classmethod
     def identity(cls) -> Alignment:
-        """The alignment that changes nothing."""
+        """The identity transform."""
         return cls(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
     def inverse(self) -> Alignment:
-        """From the aligned frame back to the input's."""
+        """The transform from the aligned frame to that of the COLMAP model."""
         back = self.rotation.T
         return Alignment(back, -(back @ self.translation) / self.scale, 1.0 / self.scale)
 
     def apply_points(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Points carried from the input's frame to the aligned one, in the dtype in which they came."""
+        """Transforms points, keeping their dtype."""
         rotation, translation = self.rotation.to(points.device), self.translation.to(points.device)
         moved = self.scale * points.to(rotation) @ rotation.T + translation
         return moved.to(points.dtype)
 
     def apply_camera(self, camera: Camera) -> Camera:
-        """The camera that sees the aligned world as `camera` sees the input's.
+        """Transforms a camera.
 
-        Camera space is scaled too (depths are `scale` times as large); the picture does not change.
+        Camera space is scaled as well (depths are multiplied by `scale`); the image does not change.
         """
         device = camera.viewmat.device
         rotation, translation = self.rotation.to(device), self.translation.to(device)
@@ -63,7 +63,7 @@ class Alignment:
         return replace(camera, viewmat=viewmat.to(camera.viewmat.dtype))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for JSON or YAML; `from_dict` reads them back without loss."""
+        """Converts the transform to plain numbers, without loss."""
         return {
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),
@@ -72,7 +72,7 @@ class Alignment:
 
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> Alignment:
-        """The alignment that `to_dict` wrote."""
+        """The inverse of `to_dict`."""
         return cls(
             rotation=torch.tensor(numbers["rotation"], dtype=torch.float64),
             translation=torch.tensor(numbers["translation"], dtype=torch.float64),
@@ -82,15 +82,15 @@ class Alignment:
 
 @dataclass(frozen=True)
 class View:
-    """One photo with its camera, in the scene's aligned frame.
+    """A photo with its camera in the aligned frame.
 
-    Pixels are read from the store of photos when they are asked for. What is read is shared: not to be written to.
+    Pixels are read from the photo store on demand. The results are shared and must not be modified.
 
     Attributes:
         name: Path relative to the scene's image folder; unique within the scene.
-        camera: Pinhole camera at the size at which the photo is used (after downscaling).
-        split: Whether the photo trains or tests.
-        photos: Where its pixels are.
+        camera: Pinhole camera for the photo after downscaling.
+        split: Whether this is a training or a test photo.
+        photos: The photo store.
     """
 
     name: str
@@ -102,64 +102,64 @@ class View:
         """RGB at the camera's size.
 
         Raises:
-            UserError: The photo cannot be read (any more).
+            UserError: The photo cannot be read.
         """
         return torch.from_numpy(self.photos.get(self.name).pixels)
 
     def read_mask(self) -> UInt8[Tensor, "H W"] | None:
-        """What the user or the file excludes: 0 = ignore; None where nothing is ignored."""
+        """Mask of the user and of transparent pixels: 0 = ignore; None if no pixel is ignored."""
         mask = self.photos.get(self.name).mask
         return None if mask is None else torch.from_numpy(mask)
 
     def read_disparity(self) -> Float[Tensor, "H W"] | None:
-        """Disparity in [0, 1], large = near, unknown scale and shift; 0 = no estimate; None without depth prior."""
+        """Disparity in [0, 1] of unknown scale and shift, large = near, 0 = no estimate; None if there is none."""
         disparity = self.photos.get(self.name).disparity
         return None if disparity is None else torch.from_numpy(disparity.astype(np.float32) / 65535.0)
 
     def read_depth(self) -> Float[Tensor, "H W"] | None:
-        """Metric depth along the camera's axis in the scene's units; 0 = no estimate; None where there is none."""
+        """Metric depth along the camera's z axis in units of the scene, 0 = no estimate; None if there is none."""
         depth = self.photos.get(self.name).depth
         return None if depth is None else torch.from_numpy(depth)
 
     def read_clean(self) -> UInt8[Tensor, "H W 3"] | None:
-        """The photo without its transients, which only evaluation may look at; None where there is none."""
+        """The photo without transients (ground truth, for evaluation only); None if there is none."""
         clean = self.photos.read_clean(self.name)
         return None if clean is None else torch.from_numpy(clean)
 
     def read_truth_mask(self) -> UInt8[Tensor, "H W"] | None:
-        """Where the photo truly shows the static scene (255) or a transient (0); None where that is not known."""
+        """Ground truth mask: 255 = static, 0 = transient; None if there is none."""
         mask = self.photos.read_truth_mask(self.name)
         return None if mask is None else torch.from_numpy(mask)
 
     def prefetch(self) -> None:
-        """Says that this photo's turn comes soon."""
+        """Announces that this photo is needed soon."""
         self.photos.prefetch(self.name)
 
     def load(self, device: torch.device) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
-        """The photo as methods take it: RGB in [0, 1], and which pixels count (False = ignore; None = all)."""
+        """The photo on a device: RGB in [0, 1], and the mask of pixels to use (False = ignore; None = all)."""
         mask = self.read_mask()
         keep = None if mask is None else upload(mask, device) > 0
         return to_unit(self.read_photo(), device), keep
 
 
 def to_unit(pixels: UInt8[Tensor, "H W 3"], device: torch.device) -> Float[Tensor, "H W 3"]:
-    """8-bit RGB as floats in [0, 1] on a device."""
+    """Converts 8-bit RGB to floats in [0, 1] on a device."""
     return upload(pixels, device).float() / 255
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A photo collection with cameras and sparse points, axes aligned.
+    """A photo collection with cameras and sparse points in the aligned frame.
 
     In the aligned frame, +z is up, and x and y are the principal axes of the points in the ground plane.
 
     Attributes:
-        root: The folder it was read from.
+        root: The scene folder.
         views: All registered photos, sorted by name.
         points: Sparse points from SfM.
-        point_colors: Their colours.
-        alignment: From the input's frame to this one.
-        observations: Which view (row in `views`) triangulated which point (row in `points`).
+        point_colors: Colours of the points.
+        alignment: Transform from the COLMAP model's frame to the aligned frame.
+        observations: Index in `views` and index in `points` of each observation of a point in a photo.
     """
 
     root: Path
@@ -171,19 +171,19 @@ class Scene:
 
     @property
     def train_views(self) -> tuple[View, ...]:
-        """The photos that train, in name order."""
+        """The training photos, sorted by name."""
         return tuple(v for v in self.views if v.split == "train")
 
     @property
     def test_views(self) -> tuple[View, ...]:
-        """The photos that are held out, in name order."""
+        """The held-out photos, sorted by name."""
         return tuple(v for v in self.views if v.split == "test")
 
 
 def observations_of(
     observations: Int[Tensor, "T 2"], names: Sequence[str], views: Sequence[View]
 ) -> Int[Tensor, "U 2"]:
-    """Observations by rows of `names` as observations by rows of `views`; those of other photos are left out."""
+    """Converts observations from indices in `names` to indices in `views`; drops those of other photos."""
     rows = {view.name: row for row, view in enumerate(views)}
     row_of = torch.tensor([rows.get(name, -1) for name in names], dtype=torch.int32)
     moved = torch.stack([row_of[observations[:, 0].long()], observations[:, 1]], dim=1)
@@ -193,12 +193,12 @@ def observations_of(
 def observed_pixels(
     scene: Scene, least_photos: int = LEAST_PHOTOS, split: Split = "train"
 ) -> dict[str, Float[Tensor, "K 2"]]:
-    """Where photos show points that photos agree on, in pixels (x, y) by the photo's name.
+    """Pixels (x, y) at which photos observe reliable points, by the photo's name.
 
     Args:
-        scene: With observations.
-        least_photos: Points that fewer photos triangulated are left out.
-        split: Which photos.
+        scene: The scene with observations.
+        least_photos: Smallest number of photos in which a point is observed.
+        split: Photos of this split only.
     """
     pairs = scene.observations.long().unique(dim=0)
     photos = pairs[:, 1].bincount(minlength=len(scene.points))
@@ -214,13 +214,13 @@ def observed_pixels(
 
 
 def scene_extent(scene: Scene) -> float:
-    """The radius of the cameras that train, in world units: by which 3DGS scales steps and splits.
+    """The scene extent, by which 3DGS scales learning rates and thresholds of densification.
 
-    1.1 times the largest distance of a camera from the cameras' mean, as in 3DGS. Cameras that share one
-    place say nothing about the scene's size; then the median distance of the points from them counts.
+    1.1 times the largest distance of a training camera from the mean of the cameras, as in 3DGS. If all cameras
+    have the same position, the median distance of the points from them is used instead.
 
     Raises:
-        ValueError: The scene has no view that trains.
+        ValueError: The scene has no training views.
     """
     if not scene.train_views:
         raise ValueError("a scene without training views has no extent")
@@ -232,7 +232,7 @@ def scene_extent(scene: Scene) -> float:
 
 
 def find_view(scene: Scene, name: str) -> View:
-    """The view of a photo by its name, or its name without the ending.
+    """The view of a photo by its name with or without extension.
 
     Raises:
         UserError: The scene has no such photo.
@@ -246,7 +246,7 @@ def find_view(scene: Scene, name: str) -> View:
 
 
 def match_view(views: Sequence[View], name: str) -> View | None:
-    """The view of a photo by its name, or its name without the ending; None where there is none."""
+    """The view of a photo by its name with or without extension, or None."""
     for view in views:
         if name in (view.name, str(Path(view.name).with_suffix(""))):
             return view

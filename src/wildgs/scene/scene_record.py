@@ -1,4 +1,4 @@
-"""A scene without its photos: written with a run, and compared with the scene that it is used with later."""
+"""A scene without its photos, stored in a run and compared with the scene folder later."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from wildgs.scene.scene import Alignment, Scene, View, observations_of
 FORMAT = "wildgs-scene-1"
 
 SAME_POSE = 1e-3
-"""Poses and points are the same if they differ by less (rotation matrices; units of the aligned frame)."""
+"""Tolerance for comparing poses (entries of rotation matrices) and positions (units of the aligned frame)."""
 
 SAME_INTRINSICS = 0.01
-"""Likewise for K, in pixels."""
+"""Tolerance for comparing K, in pixels."""
 
 MAX_CAMERA_PIXELS = 10**9
 
@@ -39,18 +39,18 @@ class SceneRecord:
     """Cameras, split, points and alignment of a scene.
 
     Attributes:
-        names: Of the photos.
-        viewmats: World-to-camera, in the aligned frame.
-        K: Intrinsics at the trained size, pixels.
+        names: Names of the photos.
+        viewmats: World-to-camera transforms, in the aligned frame.
+        K: Intrinsics at the size used in training, pixels.
         sizes: Width and height.
-        is_test: 1 for photos that are held out.
+        is_test: 1 for held-out photos.
         points: Sparse points in the aligned frame.
-        point_colors: Their colours.
-        observations: Rows of photos and of the points that they triangulated.
-        alignment: From the model's frame to the aligned one.
-        contents: Fingerprints of the files of each photo (`PhotoStore.fingerprint`); empty in records of earlier
+        point_colors: Colours of the points.
+        observations: Index of the photo and index of the point of each observation.
+        alignment: Transform from the COLMAP model's frame to the aligned frame.
+        contents: Digests of the files of each photo (`PhotoStore.fingerprint`); empty in records of earlier
             versions.
-        carried: Digests of the files in the run's `lights/` by their names; empty in records of earlier versions.
+        carried: Digests of the files in the run's `lights/` by name; empty in records of earlier versions.
     """
 
     names: tuple[str, ...]
@@ -94,15 +94,15 @@ class SceneRecord:
         with written_aside(file, flush=True) as aside:
             try:
                 save_file(tensors, aside, metadata={"wildgs": json.dumps(header)})
-            except SafetensorError as error:  # so it reports a full disk
+            except SafetensorError as error:  # raised on a full disk
                 raise OSError(error) from error
 
     @classmethod
     def read(cls, file: Path) -> SceneRecord:
-        """Reads what `write` wrote.
+        """Reads a record.
 
         Raises:
-            UserError: The file cannot be read, or is not such a file.
+            UserError: The file cannot be read, or is not a record.
         """
         try:
             check_regular(file)
@@ -111,7 +111,7 @@ class SceneRecord:
                 tensors = {name: opened.get_tensor(name).clone() for name in _FIELDS}
             if header["format"] != FORMAT:
                 raise ValueError(
-                    f"it is of another version of Wild-GS, with the format {header['format']!r:.40}"
+                    f"it was written by another version of Wild-GS, in the format {header['format']!r:.40}"
                 )
             record = cls(
                 names=tuple(str(name) for name in header["names"]),
@@ -125,15 +125,15 @@ class SceneRecord:
             OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RecursionError
         ) as error:  # fmt: skip
             raise UserError(
-                f"{file}: cannot be read as the scene of a run ({error}); copy the run folder again"
+                f"{file}: cannot be read as the scene of a run ({error}); copy the complete run folder again"
             ) from error
         return record
 
     def _check(self) -> None:
-        """Raises `ValueError` if tensors do not fit each other."""
+        """Raises `ValueError` if tensors are inconsistent."""
         views, points = len(self.names), len(self.points)
         if len(self.contents) not in (0, views):
-            raise ValueError("its fingerprints are not one for each photo")
+            raise ValueError("the number of fingerprints is wrong")
         shapes: Mapping[str, Sequence[int]] = {
             "viewmats": (views, 4, 4),
             "K": (views, 3, 3),
@@ -147,23 +147,23 @@ class SceneRecord:
             if tuple(getattr(self, name).shape) != tuple(shape):
                 raise ValueError(f"{name} has a wrong shape")
         if views == 0 or len(set(self.names)) != views:
-            raise ValueError("it names no photo, or one twice")
+            raise ValueError("it has no photos, or one of them twice")
         limits = torch.tensor([views, points])
         if bool(((self.observations < 0) | (self.observations >= limits)).any()):
-            raise ValueError("an observation is of no photo or point")
+            raise ValueError("an observation has an invalid index")
         if not all(bool(getattr(self, name).isfinite().all()) for name in ("viewmats", "K", "points")):
-            raise ValueError("a camera or point is not finite")
+            raise ValueError("a camera or point is non-finite")
         turn, shift = self.alignment.rotation, self.alignment.translation
         if (
             not bool(turn.isfinite().all() and shift.isfinite().all())
             or not 0 < self.alignment.scale < math.inf
         ):
-            raise ValueError("its alignment is none")
+            raise ValueError("its alignment is invalid")
         if bool((self.sizes < 1).any()) or bool((self.K[:, [0, 1], [0, 1]] <= 0).any()):
-            raise ValueError("a camera has no size or focal length")
+            raise ValueError("a camera has an invalid size or focal length")
         if bool((self.sizes.long().prod(dim=1) > MAX_CAMERA_PIXELS).any()):
             raise ValueError("a camera has too many pixels")
-        if bool((self.sizes > MAX_CAMERA_SIDE).any()):  # to which its small photo would be enlarged
+        if bool((self.sizes > MAX_CAMERA_SIDE).any()):  # its photo would be enlarged to this size
             raise ValueError(f"a camera is over {MAX_CAMERA_SIDE:,} pixels wide or high")
 
     def camera(self, number: int) -> Camera:
@@ -180,25 +180,25 @@ class SceneRecord:
         return Scene(root, views, self.points, self.point_colors, self.alignment, self.observations)
 
     def adopt(self, found: Scene) -> tuple[Scene, list[str]]:
-        """The recorded scene with the photos of the scene as it is now, and what differs between the two, in words.
+        """Combines the recorded scene with the photos of a scene folder, and describes the differences.
 
-        Poses, split, points and alignment are the record's; intrinsics are those of the photos found.
+        Poses, split, points and alignment are those of the record; intrinsics are those of the scene folder.
         """
         now = {view.name: view for view in found.views}
         recorded = self.scene(found.root, found.views[0].photos)
         kept = [view for view in recorded.views if view.name in now]
-        differences = _describe("gone", [name for name in self.names if name not in now])
+        differences = _describe("missing", [name for name in self.names if name not in now])
         differences += _describe("new (not used)", [name for name in now if name not in set(self.names)])
         aligned = {view.name: self._aligned(now[view.name].camera, found.alignment) for view in kept}
         moved = [view.name for view in kept if not _same_pose(view.camera, aligned[view.name])]
-        differences += _describe("in another place (the run's own is used)", moved)
+        differences += _describe("with another pose (the run's is used)", moved)
         changed = [view.name for view in kept if not _same_intrinsics(view.camera, now[view.name].camera)]
         differences += _describe("with another size or focal length", changed)
         resplit = [view.name for view in kept if view.split != now[view.name].split]
-        differences += _describe("in another split (the run's own is used)", resplit)
+        differences += _describe("in another split (the run's is used)", resplit)
         differences += self._other_files(now)
         if not self._same_points(found):
-            differences.append("other sparse points (the run's own are used)")
+            differences.append("other sparse points (the run's are used)")
         views = tuple(
             replace(view, camera=_with_intrinsics(view.camera, now[view.name].camera))
             if view.name in changed
@@ -209,7 +209,7 @@ class SceneRecord:
         return replace(recorded, views=views, observations=observations), differences
 
     def is_of(self, found: Scene) -> bool:
-        """Whether a scene is the recorded one, perhaps with some photos more or less, and not another."""
+        """Whether a scene is the recorded one, possibly with some photos added or removed."""
         now = {view.name: view for view in found.views}
         common = [number for number, name in enumerate(self.names) if name in now]
         if 2 * len(common) <= len(self.names):
@@ -221,14 +221,14 @@ class SceneRecord:
         return 2 * same > len(common)
 
     def _aligned(self, camera: Camera, alignment: Alignment) -> Camera:
-        """A camera of another alignment, carried to this one."""
+        """Transforms a camera from another alignment to this one."""
         if alignment.to_dict() == self.alignment.to_dict():
             return camera
         double = replace(camera, viewmat=camera.viewmat.double())
         return self.alignment.apply_camera(alignment.inverse().apply_camera(double))
 
     def _other_files(self, now: Mapping[str, View]) -> list[str]:
-        """What differs in the files of photos, in words; a photo that cannot be read differs in nothing."""
+        """Describes differences of the photos' files; files that cannot be read are ignored."""
         found: dict[str, list[str]] = {}
         for name, then in zip(self.names, self.contents, strict=False):
             files = now[name].photos.fingerprint(name) if name in now and then else then
@@ -262,7 +262,7 @@ def _with_intrinsics(pose: Camera, intrinsics: Camera) -> Camera:
 
 
 def _describe(how: str, names: Sequence[str]) -> list[str]:
-    """The first few photos that are different in one way."""
+    """Describes photos with one kind of difference, naming the first few."""
     if not names:
         return []
     shown = ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")

@@ -1,4 +1,4 @@
-"""The NeRF-W split files of the Phototourism scenes, and the plain hold-out where there is none."""
+"""Train/test splits: NeRF-W's split files of the Phototourism scenes, else every n-th photo."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ logger = logging.getLogger(__name__)
 
 
 def find_split_file(root: Path) -> Path | None:
-    """The scene's `*.tsv`, None where it has none.
+    """The scene's `*.tsv` file, or None.
 
     Raises:
-        UserError: There are several.
+        UserError: There are several such files.
     """
     found = sorted(root.glob("*.tsv"))
     if len(found) > 1:
@@ -32,15 +32,15 @@ def find_split_file(root: Path) -> Path | None:
 
 
 def read_split(path: Path) -> dict[str, Split]:
-    """Read a NeRF-W split: tab-separated `filename`, `id`, `split`, `dataset`.
+    """Reads a NeRF-W split: tab-separated `filename`, `id`, `split`, `dataset`.
 
-    Rows without an id are photos that NeRF-W's authors set aside; they are dropped, as NeRF-W does.
+    Rows without an id, which NeRF-W's authors excluded, are dropped.
 
     Returns:
-        From file name to split.
+        The split of each file name.
 
     Raises:
-        UserError: The file is not such a table.
+        UserError: The file cannot be read or is not such a table.
     """
     try:
         check_regular(path)
@@ -70,19 +70,19 @@ def read_split(path: Path) -> dict[str, Split]:
 
 
 def assign_splits(names: Sequence[str], root: Path, holdout: int) -> dict[str, Split]:
-    """Which photos train, which test; photos that a split file does not name are left out.
+    """Assigns photos to train and test; photos that are not in a split file are left out.
 
     Args:
         names: Photos of the model, sorted.
-        root: The scene's folder, searched for a `*.tsv`.
-        holdout: Where there is no split file, every n-th photo tests, starting with the first (as 3DGS does);
-            0 = none.
+        root: The scene folder, searched for a `*.tsv` file.
+        holdout: Without a split file, every n-th photo is a test photo, starting with the first (as in 3DGS); 0 =
+            none.
 
     Returns:
-        From name to split, in the order of `names`.
+        The split of each photo, in the order of `names`.
 
     Raises:
-        UserError: The split leaves no photo to train.
+        UserError: There are no training photos.
     """
     path = find_split_file(root)
     if path is None:
@@ -99,7 +99,7 @@ def assign_splits(names: Sequence[str], root: Path, holdout: int) -> dict[str, S
     missing = sorted(set(listed) - matched)
     if "train" not in splits.values():
         raise UserError(
-            f"{path}: the split leaves no photo to train; the model has {len(matched)} of its {len(listed)}"
+            f"{path}: the split leaves no training photo; the model has {len(matched)} of its {len(listed)} photos"
             + (f" (missing: {describe_names(missing)})" if missing else "")
         )
     if missing:
@@ -111,7 +111,7 @@ def assign_splits(names: Sequence[str], root: Path, holdout: int) -> dict[str, S
         )
     if len(splits) < len(names):
         logger.info(
-            "%d of %d photos are not in %s and stay unused", len(names) - len(splits), len(names), path.name
+            "%d of %d photos are not in %s and are not used", len(names) - len(splits), len(names), path.name
         )
     return splits
 
@@ -120,6 +120,6 @@ def _hold_out(names: Sequence[str], holdout: int) -> dict[str, Split]:
     splits: dict[str, Split] = {
         name: "test" if holdout and index % holdout == 0 else "train" for index, name in enumerate(names)
     }
-    if "train" not in splits.values():  # a scene of one photo: nothing can be held out
+    if "train" not in splits.values():  # a scene of one photo
         return dict.fromkeys(names, "train")
     return splits

@@ -1,4 +1,4 @@
-"""Trajectories by what a user writes: a built-in one, through photos by name, or from a file."""
+"""Camera paths by name: built-in ones, through photos, or from a file."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def make_path(
     size: tuple[int, int] | None = None,
     views: Sequence[str] = (),
 ) -> list[Camera]:
-    """Cameras of a video, in the scene's aligned frame.
+    """Cameras along a path, in the aligned frame.
 
     Args:
         scene: The scene.
-        kind: `orbit`, `training`, `spiral`, `views`, `still`, or the path of a camera file.
-        frames: How many; a camera file has its own number.
-        size: Width and height of the pictures; None takes the photos' usual size, or the photo's or file's own.
+        kind: `orbit`, `training`, `spiral`, `views`, `still`, or a camera file.
+        frames: Number of cameras; a camera file has its own.
+        size: Width and height in pixels; None takes that of the file, the still's photo, or the typical photo.
         views: Names of photos, for `views` and `still`.
 
     Raises:
-        UserError: There is no such path or photo, or the file cannot be read.
+        UserError: The path or a photo does not exist, or the file cannot be read.
     """
     if frames < 1:
         raise UserError(f"{frames} frames: a path needs at least one")
@@ -47,15 +47,15 @@ def make_path(
     if str(kind) in THROUGH:
         return _through(scene, str(kind), frames, size, views)
     if not Path(kind).suffix:
-        known = ", ".join([*AROUND, *THROUGH])
-        raise UserError(f"{kind}: there is no such path; choose {known}, or give a camera file (.json)")
+        paths = ", ".join([*AROUND, *THROUGH])
+        raise UserError(f"{kind}: unknown path; choose {paths}, or give a camera file (.json)")
     if size is not None:
-        raise UserError(f"{kind}: a camera file says itself how large its pictures are; leave the size out")
+        raise UserError(f"{kind}: a camera file defines the size of its images; leave the size out")
     return read_path(scene, Path(kind))[0]
 
 
 def read_path(scene: Scene, file: Path) -> tuple[list[Camera], float]:
-    """Cameras of a camera file in the scene's aligned frame, and its frames per second.
+    """Cameras of a camera file in the aligned frame, and its frames per second.
 
     Raises:
         UserError: The file cannot be used.
@@ -77,18 +77,17 @@ def _through(
     chosen = [find_view(scene, name) for name in names]
     if kind == "still":
         camera = chosen[0].camera
-        # Not through a new lens: the photo's own camera may have its centre off the middle.
+        # The photo's own camera, whose principal point may not be the centre of the image.
         return [camera] * frames if size is None else still(camera, frames, *size)
     return interpolate([view.camera for view in chosen], frames, *(size or usual_size(chosen)))
 
 
 def usual_size(views: Sequence[View]) -> tuple[int, int]:
-    """Median short and long side of photos, rounded down to even numbers; it lies, as screens do.
+    """Typical size of photos: median short and long side, rounded down to even numbers.
 
-    It stands where two thirds of the photos do: what people turn their cameras for (a tower, a statue) does not
-    fit on a frame that lies.
+    Landscape, or portrait if at least two thirds of the photos are (of a tower or a statue, for example).
     """
     sizes = np.array([sorted((view.camera.width, view.camera.height)) for view in views])
     short, long = (max(2, int(np.median(side)) // 2 * 2) for side in sizes.T)
-    standing = sum(view.camera.height > view.camera.width for view in views)
-    return (short, long) if 3 * standing >= 2 * len(views) > 0 else (long, short)
+    portraits = sum(view.camera.height > view.camera.width for view in views)
+    return (short, long) if 3 * portraits >= 2 * len(views) > 0 else (long, short)

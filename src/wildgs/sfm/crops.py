@@ -1,4 +1,4 @@
-"""Copies and crops of one photo: pairs whose matches differ by scale and shift alone."""
+"""Detects copies and crops of photos: pairs whose matches are related by scale and translation only."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
 CANDIDATE_LIKENESS = 0.2
-"""Least likeness of candidates by retrieval; a crop has 0.42, different photos of one place have 0.3 at most."""
+"""Smallest similarity by retrieval of candidates; a crop has 0.42, different photos of one place at most 0.3."""
 
 LEAST_MATCHES = 60
 LEAST_SHARE = 0.4
-"""Of the features in the common part that match; photos from one place at different times have 0.15."""
+"""Smallest fraction of matching features in the common part; photos of one place at different times have 0.15."""
 LARGEST_ERROR = 0.003
-"""Deviation from scale and shift, as a share of the long side."""
+"""Largest deviation from scale and translation, relative to the longer side."""
 
 
 def find_crops(work: Workplace, copies: Sequence[WorkingCopy], pairs: Iterable[Pair]) -> dict[int, int]:
-    """From copies and crops of a photo to the one of them that shows the most.
+    """Maps copies and crops of a photo to the one with the largest field of view.
 
     Args:
-        work: Its database holds the matches of the pairs.
+        work: The workplace; its database contains the matches of the pairs.
         copies: All photos.
-        pairs: Pairs to look at.
+        pairs: Pairs to check.
     """
     original: dict[int, int] = {}
     with closing(pycolmap.Database.open(work.database)) as database:
@@ -42,7 +42,7 @@ def find_crops(work: Workplace, copies: Sequence[WorkingCopy], pairs: Iterable[P
             scale = crop_scale(database, first, second)
             if scale is None:
                 continue
-            # In the frame of the second photo: the one whose frame is larger is the original.
+            # The original is the photo with the larger frame, in pixels of the second photo.
             widths = [database.read_camera(database.read_image(i).camera_id).width for i in (first, second)]
             larger, smaller = (a, b) if widths[0] * scale >= widths[1] else (b, a)
             larger, smaller = original.get(larger, larger), original.get(smaller, smaller)
@@ -72,7 +72,7 @@ def _scale_of_crop(
     a, b = first[matches[:, 0]], second[matches[:, 1]]
     kept = np.ones(len(a), dtype=bool)
     scale, shift, error = 1.0, np.zeros(2), np.zeros(len(a))
-    for _ in range(4):  # least squares of what fits
+    for _ in range(4):  # least squares on inliers
         centred = a[kept] - a[kept].mean(axis=0)
         scale = float((centred * (b[kept] - b[kept].mean(axis=0))).sum() / max((centred**2).sum(), 1e-9))
         shift = b[kept].mean(axis=0) - scale * a[kept].mean(axis=0)

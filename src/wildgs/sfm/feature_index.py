@@ -1,8 +1,7 @@
-"""An index of SIFT descriptors of a scene's triangulated points, in which new photos are localised.
+"""An index of SIFT descriptors of a scene's triangulated points, for localising new photos.
 
-Features are detected in the scene's photos, and those at the observation of a point describe the point. This needs
-only what a run carries (`wildgs.scene.carried`): cameras, points, observations and photos, and no database of the
-reconstruction.
+Features are extracted from the scene's photos; those at the observations of a point are its descriptors. This only
+needs the data in a run folder (`wildgs.scene.carried`), not the database of the reconstruction.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ from wildgs.scene import Scene, View
 from wildgs.sfm.mapping import quiet
 
 MAX_PHOTOS = 200
-"""Photos whose features are found; of larger scenes those that observe the most points."""
+"""Upper bound on the number of photos in the index, those that observe the most points."""
 
 MAX_IMAGE_SIZE = 1600
-"""Features are sought at no more than this many pixels on the long side."""
+"""Longest side in pixels at which features are extracted."""
 
 SAME_PLACE = 0.0025
-"""Largest distance of a feature from an observation of the same point, as a share of the photo's long side."""
+"""Largest distance of a feature from the observation of its point, relative to the photo's longer side."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,9 @@ class FeatureIndex:
     """Triangulated points with their descriptors.
 
     Attributes:
-        descriptors: SIFT, as COLMAP stores it (root of L1-normalised, norm about 512).
-        owners: For every descriptor, its row in `points`.
-        points: Positions in the scene's aligned frame.
+        descriptors: SIFT descriptors as stored by COLMAP (square root of L1-normalised, norm about 512).
+        owners: Index in `points` of every descriptor.
+        points: Positions in the aligned frame.
     """
 
     descriptors: UInt8[np.ndarray, "D 128"]
@@ -56,12 +55,12 @@ class FeatureIndex:
 def load_feature_index(
     scene: Scene, cache: Path | None = None, progress: Counter | None = None
 ) -> FeatureIndex:
-    """The feature index of a scene, from the cache where that is of this scene.
+    """Creates the feature index of a scene, or reads it from a valid cache.
 
     Args:
-        scene: Its photos, cameras and points with their observations.
-        cache: File that keeps the index; None keeps nothing, and a folder that cannot be written to is no fault.
-        progress: Called with (photos looked at, photos in all).
+        scene: The scene with photos, cameras, points and observations.
+        cache: File that caches the index; None does not cache, and a file that cannot be written is ignored.
+        progress: Called with (photos done, total number of photos).
 
     Raises:
         UserError: The scene's photos observe no points, or cannot be read.
@@ -101,14 +100,14 @@ def _index_features(scene: Scene, progress: Counter | None) -> FeatureIndex:
     chosen = chosen[counts[chosen] > 0].sort().values.tolist()
     if not chosen:
         raise UserError(
-            f"{scene.root}: the sparse model does not say which points its photos observe, so new photos cannot be "
-            "localised; choose a photo of the scene whose camera they borrow (--like)"
+            f"{scene.root}: the sparse model has no observations of points, so new photos cannot be localised; "
+            "choose a photo of the scene whose camera is used for them (--like)"
         )
     points = scene.points.double().numpy()
     descriptors, owners = [np.zeros((0, 128), np.uint8)], [np.zeros(0, np.int64)]
     for done, row in enumerate(chosen, start=1):
         observed = scene.observations[scene.observations[:, 0] == row][:, 1].long()
-        with contextlib.suppress(UserError):  # a photo that cannot be read is passed over
+        with contextlib.suppress(UserError):  # unreadable photos are skipped
             found, whose = _described_points(scene.views[row], scene.points, observed)
             descriptors.append(found)
             owners.append(whose)
@@ -117,8 +116,8 @@ def _index_features(scene: Scene, progress: Counter | None) -> FeatureIndex:
     index = FeatureIndex(np.concatenate(descriptors), np.concatenate(owners), points)
     if len(index.descriptors) == 0:
         raise UserError(
-            f"{scene.root}: no SIFT feature of its photos lies where the sparse model has a point, so new photos "
-            "cannot be localised; choose a photo of the scene whose camera they borrow (--like)"
+            f"{scene.root}: no SIFT feature of its photos is at a point of the sparse model, so new photos cannot "
+            "be localised; choose a photo of the scene whose camera is used for them (--like)"
         )
     return index
 
@@ -126,7 +125,7 @@ def _index_features(scene: Scene, progress: Counter | None) -> FeatureIndex:
 def _described_points(
     view: View, points: Float[Tensor, "P 3"], observed: Int[Tensor, " O"]
 ) -> tuple[UInt8[np.ndarray, "D 128"], Int64[np.ndarray, " D"]]:
-    """Descriptors of the features at a photo's observations, and the rows of the points observed."""
+    """Descriptors of the features at a photo's observations, and the indices of the observed points."""
     camera = view.camera
     detail = view.photos.detail or MAX_IMAGE_SIZE
     features, descriptors = find_features(view.read_photo().numpy(), min(MAX_IMAGE_SIZE, detail))
@@ -146,9 +145,9 @@ def _described_points(
 def find_features(
     pixels: UInt8[np.ndarray, "H W 3"], limit: int = MAX_IMAGE_SIZE
 ) -> tuple[Float64[np.ndarray, "F 2"], UInt8[np.ndarray, "F 128"]]:
-    """SIFT features of an RGB photo: positions in its pixels, and descriptors.
+    """SIFT features of an RGB photo: positions in pixels, and descriptors.
 
-    They are sought at no more than `limit` pixels on the long side.
+    Features are extracted at a longer side of at most `limit` pixels.
     """
     height, width = pixels.shape[:2]
     grey = Image.fromarray(pixels).convert("L")
@@ -163,15 +162,15 @@ def find_features(
 def match_features(
     features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, ratio: float
 ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
-    """Features that look like one point and like no other (Lowe's ratio test, over points instead of features).
+    """Matches features to points by Lowe's ratio test, applied to points instead of features.
 
     Args:
         features: Descriptors of a new photo.
-        index: The points that are sought.
-        ratio: Largest distance to the best point, relative to the best of all other points.
+        index: The points.
+        ratio: Largest ratio of the distance to the best point and to the second best point.
 
     Returns:
-        Rows of features and of points; every point once, with the feature most like it.
+        Indices of features and of points; every point occurs once, with its most similar feature.
     """
     likeness, owners = _nearest(features, index)
     distance = np.arccos(np.clip(likeness, -1, 1))
@@ -179,14 +178,14 @@ def match_features(
     good = np.flatnonzero(distance[:, 0] < ratio * np.minimum(rivals, np.pi / 2))
     best: dict[int, int] = {}
     for feature in good[np.argsort(-distance[good, 0])]:
-        best[int(owners[feature, 0])] = int(feature)  # the last written is the nearest
+        best[int(owners[feature, 0])] = int(feature)  # sorted by decreasing distance: the nearest is kept
     return np.array(list(best.values()), np.int64), np.array(list(best.keys()), np.int64)
 
 
 def _nearest(
     features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, count: int = 8, block: int = 65_536
 ) -> tuple[Shaped[np.ndarray, "F k"], Int64[np.ndarray, "F k"]]:
-    """Cosine and owner of the descriptors most alike, the best first, without the whole table in memory."""
+    """Cosine similarity and owner of the most similar descriptors, best first, computed in blocks."""
     queries = torch.nn.functional.normalize(torch.from_numpy(features).float(), dim=1)
     owners = torch.from_numpy(index.owners)
     likeness, best = torch.zeros(len(queries), 0), torch.zeros(len(queries), 0, dtype=torch.int64)

@@ -1,4 +1,4 @@
-"""Lenses that no photograph has: stitched panoramas, little planets, and poses that only such a lens explains."""
+"""Detects implausible lenses: stitched panoramas, little planets, and wrong poses."""
 
 from __future__ import annotations
 
@@ -8,45 +8,45 @@ import numpy as np
 import pycolmap
 
 FOCAL_RANGE = (0.3, 30.0)
-"""Focal lengths of photographs, relative to the long side: fields of view from 118 to 2 degrees."""
+"""Plausible focal lengths relative to the longer side: fields of view from 118 to 2 degrees."""
 
 MAX_DISTORTION = 0.3
-"""Largest shift of a photo's corners by its lens, relative to their distance from the middle."""
+"""Largest displacement of a photo's corners by distortion, relative to their distance from the centre."""
 
 MAX_ERROR = 0.008
-"""Largest reprojection error of a point that agrees with a plain lens, as a share of the long side."""
+"""Largest reprojection error of an inlier without distortion, relative to the longer side."""
 LEAST_POINTS, LEAST_SHARE = 15, 0.6
-"""Of a photo's points, that must agree."""
+"""Smallest number and fraction of inliers among a photo's points."""
 
 
 def lens_fault(camera: Any) -> str | None:
-    """Why a camera cannot be that of a photo, None where it can.
+    """The reason why a camera is implausible, or None.
 
     Args:
-        camera: pycolmap's; SIMPLE_RADIAL's distortion is judged, of other models only the focal length.
+        camera: pycolmap's camera; distortion is checked for SIMPLE_RADIAL only.
     """
     focal = camera.mean_focal_length() / max(camera.width, camera.height)
     if not FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1]:
         degrees = 2 * np.degrees(np.arctan(0.5 / focal))
-        return f"no lens has its field of view ({degrees:.0f} degrees): a stitched panorama or a wrong pose"
+        return f"implausible field of view ({degrees:.0f} degrees): a stitched panorama or a wrong pose"
     if camera.model_name != "SIMPLE_RADIAL":
         return None
     corner = np.hypot(camera.width, camera.height) / 2 / camera.params[0]
     shift = float(camera.params[3]) * corner**2
-    # Where 1 + 3 k r^2 is negative, two places of the scene fall on one pixel.
+    # If 1 + 3 k r^2 is negative, the distortion is not injective.
     if abs(shift) > MAX_DISTORTION or 1 + 3 * shift < 0:
-        bent = f"{abs(shift):.0%} at the corners"
-        return f"no lens bends so much ({bent}): a panorama, a little planet or a wrong pose"
+        amount = f"{abs(shift):.0%} at the corners"
+        return f"implausible distortion ({amount}): a panorama, a little planet or a wrong pose"
     return None
 
 
 def drop_impossible(model: Any) -> dict[str, str]:
-    """Takes photos with an impossible lens out of a model, where no plain lens explains their points as well.
+    """Removes photos with an implausible lens from a model, unless a lens without distortion explains their points.
 
-    Features in the middle of a photo say little about its corners, so that many a real lens comes out bent.
+    If features are only in the centre of a photo, the distortion of a real lens may be estimated badly.
 
     Returns:
-        From the names of the photos taken out to what is wrong with them.
+        The reasons by the names of the removed photos.
     """
     faults = {}
     for image_id in list(model.reg_image_ids()):
@@ -59,7 +59,7 @@ def drop_impossible(model: Any) -> dict[str, str]:
 
 
 def _straighten(model: Any, image: Any) -> bool:
-    """Gives a photo a lens without distortion if most of its points agree with one; whether they do."""
+    """Replaces a photo's lens by one without distortion if most of its points agree; returns whether they do."""
     rows = [row for row, point in enumerate(image.points2D) if point.has_point3D()]
     pixels = np.array([image.points2D[row].xy for row in rows], dtype=np.float64)
     points = np.array([model.point3D(image.points2D[row].point3D_id).xyz for row in rows], dtype=np.float64)

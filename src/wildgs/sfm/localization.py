@@ -1,7 +1,7 @@
-"""Localisation: the camera of a new photo in the scene's SfM model.
+"""Localisation: estimates the camera of a new photo in the scene's SfM model.
 
-SIFT features are matched to the model's points, and the pose comes from RANSAC and refinement by pycolmap. The
-focal length is that of the EXIF block, or estimated with the pose.
+SIFT features are matched to the model's points, and pycolmap estimates the pose by RANSAC and refinement. The focal
+length is taken from EXIF data or estimated with the pose.
 """
 
 from __future__ import annotations
@@ -23,27 +23,25 @@ from wildgs.geometry.camera import Camera
 from wildgs.scene.images import UnreadableImageError, open_image, read_photo
 from wildgs.scene.undistort import PixelGrid, sample_colors
 from wildgs.sfm.feature_index import FeatureIndex, find_features, match_features
+from wildgs.sfm.lenses import FOCAL_RANGE
 from wildgs.sfm.mapping import quiet
 from wildgs.sfm.upright import save_jpeg
 
 MIN_INLIERS = 15
-"""Least inliers of a pose; photos of other places reach 5."""
+"""Smallest number of inliers of a pose; photos of other places have up to 5."""
 
 MATCH_RATIO = 0.85
 MAX_ERROR = 0.008
-"""Largest reprojection error of an inlier, as a share of the photo's long side (8 pixels of 1,000)."""
+"""Largest reprojection error of an inlier, relative to the photo's longer side (8 pixels of 1,000)."""
 
 REFINE_LENS = 60
-"""Inliers from which the lens's distortion is estimated too."""
+"""Number of inliers from which distortion is estimated as well."""
 
 EXIF_SIDE = 256
-"""Pixels of the picture that carries an EXIF block: focal lengths are relative to the sides."""
-
-FOCAL_RANGE = (0.3, 30.0)
-"""Focal lengths of photographs, relative to the long side; a pose that needs another is wrong."""
+"""Longest side of the temporary image for reading EXIF data; focal lengths are relative to the image size."""
 
 MAX_DISTORTION = 0.2
-"""Largest shift of a photo's corners by its lens, relative to their distance from the middle."""
+"""Largest displacement of a photo's corners by distortion, relative to their distance from the centre."""
 
 
 class LocalizationError(UserError):
@@ -55,12 +53,12 @@ class LocalizedPhoto:
     """A new photo with its camera.
 
     Attributes:
-        photo: Undistorted, at the size at which the scene's photos are used.
-        camera: Its pinhole camera in the scene's aligned frame.
-        inliers: Matches that agree with the pose.
-        matches: Points that match features of the photo.
-        focal: Focal length, relative to the long side.
-        focal_from_exif: Whether the search began at the EXIF block's focal length.
+        photo: The undistorted photo, at the size of the scene's photos.
+        camera: Its pinhole camera in the aligned frame.
+        inliers: Number of inliers of the pose.
+        matches: Number of matches between features and points.
+        focal: Focal length, relative to the longer side.
+        focal_from_exif: Whether the initial focal length is from EXIF data.
     """
 
     photo: UInt8[Tensor, "H W 3"]
@@ -71,7 +69,7 @@ class LocalizedPhoto:
     focal_from_exif: bool
 
     def describe(self) -> str:
-        """A line for the user."""
+        """Describes the result in one line."""
         origin = "from EXIF, refined" if self.focal_from_exif else "estimated"
         return (
             f"localised with {self.inliers} inliers of {self.matches} matches, focal length"
@@ -80,42 +78,42 @@ class LocalizedPhoto:
 
 
 def localize(file: Path, index: FeatureIndex, long_side: int, *, seed: int = 0) -> LocalizedPhoto:
-    """Finds the camera of a photo of the scene.
+    """Estimates the camera of a new photo of the scene.
 
     Args:
         file: The photo; any size, upright or with an EXIF orientation.
         index: Feature index of the scene.
-        long_side: Pixels to which the photo is shrunk for use.
-        seed: Of RANSAC.
+        long_side: Longest side, in pixels, of the resulting photo.
+        seed: Random seed of RANSAC.
 
     Raises:
         UserError: The file cannot be read.
-        LocalizationError: Too little of the photo agrees with the scene.
+        LocalizationError: There are too few inliers.
     """
     try:
         pixels = read_photo(file).pixels
     except UnreadableImageError as error:
-        raise UserError(f"{file}: {error}; give a photo or picture that opens") from error
-    camera, known = guess_camera(file, pixels.shape[1], pixels.shape[0])
+        raise UserError(f"{file}: {error}; give a readable image") from error
+    camera, focal_known = guess_camera(file, pixels.shape[1], pixels.shape[0])
     features, descriptors = find_features(pixels)
     matched, seen = (np.zeros(0, np.int64),) * 2
     if len(features):
         matched, seen = match_features(descriptors, index, MATCH_RATIO)
-    answer = solve_pose(features[matched], index.points[seen], camera, known, seed)
+    answer = solve_pose(features[matched], index.points[seen], camera, focal_known, seed)
     inliers = 0 if answer is None else int(answer["num_inliers"])
     if answer is None or inliers < MIN_INLIERS:
         raise LocalizationError(
             f"{file}: could not be localised ({inliers} inliers of {len(matched)} matches with the scene's"
             f" points; at least {MIN_INLIERS} are needed)"
         )
-    return _as_view(pixels, camera, answer["cam_from_world"], long_side, inliers, len(matched), known)
+    return _as_view(pixels, camera, answer["cam_from_world"], long_side, inliers, len(matched), focal_known)
 
 
 def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
-    """A camera with the EXIF block's focal length where it has one, and whether it has.
+    """An initial camera, and whether its focal length is from EXIF data.
 
-    COLMAP (in C++, in the trainer's own process where a viewer asks) sees no byte of the file: only the entries
-    that Pillow could read, rewritten beside a small empty picture of the same shape.
+    For safety, COLMAP does not read the file but a small blank image of the same aspect ratio with those EXIF
+    entries that Pillow could read.
     """
     try:
         with tempfile.TemporaryDirectory() as folder, open_image(file) as image, quiet():
@@ -123,10 +121,10 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
             blank.thumbnail((EXIF_SIDE, EXIF_SIDE))
             save_jpeg(blank, image, Path(folder) / "exif.jpg")
             read = pycolmap.infer_camera_from_image(Path(folder) / "exif.jpg")
-        known = bool(read.has_prior_focal_length)
+        focal_known = bool(read.has_prior_focal_length)
         focal = read.mean_focal_length() / max(read.width, read.height)
-    except Exception:  # no EXIF block that makes sense
-        known, focal = False, 1.2
+    except Exception:  # missing or invalid EXIF data
+        focal_known, focal = False, 1.2
     long_side = max(width, height)
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL",
@@ -134,24 +132,24 @@ def guess_camera(file: Path, width: int, height: int) -> tuple[Any, bool]:
         height=height,
         params=[focal * long_side, width / 2, height / 2, 0.0],
     )
-    return camera, known
+    return camera, focal_known
 
 
 def solve_pose(
     pixels: Float64[np.ndarray, "M 2"],
     points: Float64[np.ndarray, "M 3"],
     camera: Any,
-    known: bool,
+    focal_known: bool,
     seed: int,
 ) -> dict[str, Any] | None:
-    """The pose, None where there is none that a photograph could have.
+    """Estimates a pose; None if there is no plausible one.
 
-    The camera's focal length is refined in place, and with enough points its distortion.
+    The camera's focal length and, with enough points, its distortion are refined in place.
     """
     if len(pixels) < 4:
         return None
     estimation = pycolmap.AbsolutePoseEstimationOptions()
-    estimation.estimate_focal_length = not known
+    estimation.estimate_focal_length = not focal_known
     estimation.ransac.max_error = MAX_ERROR * max(camera.width, camera.height)
     estimation.ransac.random_seed = seed
     estimation.ransac.min_inlier_ratio = 0.02
@@ -186,9 +184,9 @@ def _as_view(
     long_side: int,
     inliers: int,
     matches: int,
-    known: bool,
+    focal_known: bool,
 ) -> LocalizedPhoto:
-    """The photo as a view of the scene: pinhole camera, aligned frame, size of the scene's photos."""
+    """Undistorts and resizes the photo and converts its camera."""
     longest = max(camera.width, camera.height)
     grid = PixelGrid.from_colmap(camera, max_side=long_side)
     image = Image.fromarray(pixels).resize(grid.resized, Image.Resampling.LANCZOS)
@@ -202,5 +200,5 @@ def _as_view(
         inliers=inliers,
         matches=matches,
         focal=float(camera.params[0]) / longest,
-        focal_from_exif=known,
+        focal_from_exif=focal_known,
     )

@@ -1,8 +1,9 @@
-"""Photos of look-alikes: their matches contradict the poses.
+"""Detects photos whose matches contradict their poses, because they show a look-alike or have a wrong pose.
 
-A pair whose own matches agree on an epipolar geometry, but not on that of the two poses, shows two places that look
-alike, or one of the two is wrongly placed. A photo most of whose matches contradict is doubtful. Checking pairs
-against the whole is the idea of Zach et al., "Disambiguating visual relations using loop constraints", CVPR 2010.
+The matches of a pair have a verified epipolar geometry. If it contradicts that of the two poses, the photos show
+different places that look alike, or one of the poses is wrong. A photo is doubtful if most of its matches
+contradict its pose. The idea of checking pairs against the whole model is due to Zach et al., "Disambiguating
+visual relations using loop constraints", CVPR 2010.
 """
 
 from __future__ import annotations
@@ -17,22 +18,22 @@ import pycolmap
 from jaxtyping import Float64, Shaped
 
 LEAST_MATCHES = 30
-"""Pairs with fewer matches are often wrong by chance and prove nothing."""
+"""Smallest number of matches of a pair to be considered; fewer are often wrong by chance."""
 
 MAX_ERROR = 0.01
-"""Largest distance from the epipolar line of a match that agrees, as a share of the long side."""
+"""Largest distance from the epipolar line of a match that agrees, relative to the longer side."""
 
 AGREEING_SHARE = 0.5
-"""Of a pair's matches, that must agree with the poses."""
+"""Smallest fraction of a pair's matches that must agree with the poses."""
 
 
 def find_doubtful(model: Any, database_file: Path, names: Mapping[str, str]) -> dict[str, str]:
-    """From names of photos to what contradicts their poses.
+    """The reasons why poses are doubtful, by photo name.
 
     Args:
-        model: pycolmap's.
-        database_file: With the verified matches.
-        names: Under which messages name the photos.
+        model: pycolmap's reconstruction.
+        database_file: Database with the verified matches.
+        names: Names of the photos for messages.
     """
     agreeing: dict[str, int] = {}
     contradicting: dict[str, dict[str, int]] = {}
@@ -69,7 +70,7 @@ def _judge(
 
 
 def agreeing_share(first: Any, second: Any, matches: Shaped[np.ndarray, "M 2"]) -> float:
-    """Share of the matches of two images that lie on the epipolar lines of their poses, on both sides."""
+    """Fraction of the matches of two images that agree with the epipolar geometry of their poses in both images."""
     places = [_keypoints(image)[matches[:, side]] for side, image in enumerate((first, second))]
     rays = [_unproject(image.camera, points) for image, points in zip((first, second), places, strict=True)]
     relative = second.cam_from_world() * first.cam_from_world().inverse()

@@ -1,4 +1,4 @@
-"""Poses by pycolmap's incremental mapping, and a second chance for the photos that it leaves out.
+"""Camera poses by pycolmap's incremental mapping, and continued mapping of photos without a pose.
 
 Source: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 """
@@ -18,16 +18,16 @@ from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
 LEAST_GROUP = 3
-"""Photos of the smallest model that is looked for."""
+"""Smallest number of photos of a model."""
 
 LATE_INLIERS = 15
-"""Inliers with which a photo is placed at its second chance; the first asks for 30."""
+"""Smallest number of inliers for registering a photo in later passes; 30 in the first."""
 LATE_INLIER_RATIO = 0.1
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silences COLMAP's log on stderr; errors are exceptions and empty results."""
+    """Silences COLMAP's log on stderr."""
     previous = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
@@ -39,7 +39,7 @@ def quiet() -> Iterator[None]:
 def map_photos(
     work: Workplace, count: int, config: SfmConfig, progress: Progress, only: Sequence[str] = ()
 ) -> list[Any]:
-    """All models by incremental mapping, the largest first; of some working copies, or of all."""
+    """Runs incremental mapping on some working copies or on all; returns all models, largest first."""
     options = _options(config)
     options.image_names = list(only)
     models = pycolmap.incremental_mapping(
@@ -47,13 +47,13 @@ def map_photos(
         work.images,
         work.fresh("mapping"),
         options,
-        next_image_callback=_counted(progress, 2, count),  # a model starts from a pair
+        next_image_callback=_counted(progress, 2, count),  # a model starts with a pair
     )
     return by_size(models.values())
 
 
 def continue_mapping(work: Workplace, model: Any, count: int, config: SfmConfig, progress: Progress) -> Any:
-    """The model with the photos that match it now, or with fewer inliers than the first pass asks for."""
+    """Registers further photos in a model, with fewer inliers than in the first pass."""
     start = work.fresh("start")
     model.write(start)
     options = _options(config)
@@ -94,12 +94,12 @@ def _counted(progress: Progress, start: int, count: int) -> Callable[[], None]:
 
 
 def by_size(models: Collection[Any]) -> list[Any]:
-    """Models, the largest first."""
+    """Sorts models by size, largest first."""
     return sorted(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
 
 
 def find_registered(model: Any, copy: WorkingCopy) -> Any | None:
-    """The photo's image in a model, None where it has no pose there."""
+    """The photo's image in a model; None if it has no pose there."""
     image = model.find_image_with_name(copy.work_name)
     return image if image is not None and image.has_pose else None
 

@@ -1,4 +1,4 @@
-"""Pictures of the matches of photos that got no pose, for the report of a run."""
+"""Images of the matches of photos without a pose, for the report of a run."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
 FOLDER = "matches"
-"""Of the scene, where the pictures lie."""
+"""Folder of the images in the scene folder."""
 MAX_PICTURES = 40
 SIDE = 320
-"""Longer side of each of the two photos in a picture, pixels."""
+"""Longer side, in pixels, of each of the two photos in an image."""
 COLORS = ((230, 60, 60), (60, 200, 80), (70, 140, 255), (240, 200, 40), (220, 80, 220))
 
 
 def write_match_pictures(
     work: Workplace, copies: Sequence[WorkingCopy], failures: Mapping[str, Failure]
 ) -> dict[str, str]:
-    """Draws each photo without a pose beside its best partner, with the matches that agree between the two.
+    """Draws each photo without a pose beside the photo that it matches best, with their verified matches.
 
     Returns:
-        From names of photos to files, relative to the scene; photos without a partner have none.
+        The files, relative to the scene folder, by photo name; photos without matches have none.
     """
     rows = {copy.name: row for row, copy in enumerate(copies)}
     pictures = {}
@@ -60,7 +60,7 @@ def write_match_pictures(
 
 
 def draw_matches(photos: Sequence[Image.Image], places: Sequence[Float[np.ndarray, "M 2"]]) -> Image.Image:
-    """Two photos side by side, with a line for each match."""
+    """Draws two photos side by side with a line for each match."""
     small = [photo.copy() for photo in photos]
     for photo in small:
         photo.thumbnail((SIDE, SIDE))

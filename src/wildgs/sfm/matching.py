@@ -1,4 +1,4 @@
-"""Features, pairs and matches by pycolmap."""
+"""Feature extraction, pair selection and matching with pycolmap."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from wildgs.sfm.workplace import Workplace
 
 EXTRACTION_BATCH = 16
 MATCHING_BLOCK = 50
-"""Photos per block of pairs: COLMAP keeps the features of two blocks in memory."""
+"""Photos per block of pairs; COLMAP keeps the features of two blocks in memory."""
 
 TOLERANT_RATIO = 0.85
-"""Largest distance to the best feature relative to the second best, at the second chance; 0.8 at the first."""
+"""Lowe's ratio in later passes; 0.8 in the first."""
 TOLERANT_INLIER_RATIO = 0.1
-"""Share of correct matches for which RANSAC's trials suffice; 0.25 at the first chance."""
+"""Smallest inlier ratio, which determines the number of RANSAC trials, in later passes; 0.25 in the first."""
 
 
 def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> None:
-    """Find SIFT features in all copies, with a camera of its own for each."""
+    """Extracts SIFT features from all copies, with a separate camera for each."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = config.max_image_size
     options.num_threads = config.threads
     options.sift.max_num_features = config.max_features
     options.sift.estimate_affine_shape = config.affine_features
     done = 0
-    # COLMAP passes over photos without a mask once it is given a folder of masks, so these go apart.
+    # Separate calls, because COLMAP skips photos without a mask if a folder of masks is given.
     for masked in (False, True):
         reader = pycolmap.ImageReaderOptions()
         if masked:
             reader.mask_path = work.masks
         names = [copy.work_name for copy in copies if copy.masked == masked]
         for batch in _batches(work, names):
-            progress("finding features", done, len(copies))
+            progress("extracting features", done, len(copies))
             pycolmap.extract_features(
                 work.database,
                 work.images,
@@ -55,11 +55,11 @@ def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, p
                 extraction_options=options,
             )
             done += len(batch)
-    progress("finding features", done, len(copies))
+    progress("extracting features", done, len(copies))
 
 
 def _batches(work: Workplace, names: Sequence[str]) -> Iterator[list[str]]:
-    """Copies that COLMAP may decode at the same time: its threads keep whole pictures."""
+    """Batches of copies that COLMAP may decode at the same time, to limit memory."""
     batch: list[str] = []
     pixels = 0
     for name in names:
@@ -75,7 +75,7 @@ def _batches(work: Workplace, names: Sequence[str]) -> Iterator[list[str]]:
 
 
 def describe_photos(work: Workplace, copies: Sequence[WorkingCopy], seed: int) -> Float[Tensor, "N D"]:
-    """A unit vector a photo, by which it is retrieved."""
+    """A unit vector per photo for retrieval."""
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
 
@@ -95,12 +95,12 @@ def match(
     config: SfmConfig,
     progress: Progress,
 ) -> tuple[Pairing, dict[int, int]]:
-    """Choose the pairs, match their features and verify the matches by epipolar geometry.
+    """Selects pairs, matches their features and verifies the matches by epipolar geometry.
 
-    The photos most alike are matched first: copies and crops of one photo are matched with it alone from then on.
+    The most similar photos are matched first, to find copies and crops, which are not matched with other photos.
 
     Returns:
-        The pairs that were matched, and from copies and crops to the photo that they were made from.
+        The matched pairs, and a mapping from copies and crops to the original photo.
     """
     progress("choosing pairs", 0, 0)
     likeness = vlads @ vlads.T
@@ -132,15 +132,15 @@ def match_pairs(
     *,
     tolerant: bool = False,
 ) -> None:
-    """Match pairs and verify the matches; what the database holds already is not matched again.
+    """Matches pairs and verifies the matches, except those already in the database.
 
     Args:
-        work: Its database holds the features, and takes the matches.
+        work: The workplace; its database contains the features, and the matches are written to it.
         copies: All photos.
-        pairs: Pairs of them.
+        pairs: Pairs to match.
         config: Threads and seed.
-        progress: Called with (pairs matched, pairs in all).
-        tolerant: Whether less distinct features are matched, and geometries found among more wrong matches.
+        progress: Called with (pairs matched, total number of pairs).
+        tolerant: Whether to use the thresholds of later passes.
     """
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = config.threads
@@ -150,7 +150,7 @@ def match_pairs(
         options.sift.max_ratio = TOLERANT_RATIO
         verification.ransac.min_inlier_ratio = TOLERANT_INLIER_RATIO
     lists = work.root / "pairs.txt"
-    # Pairs of the same two blocks of photos go together, so that features are read once per block.
+    # Sorted by blocks of photos, so that features are read once per block.
     ordered = sorted(pairs, key=lambda pair: (pair[0] // MATCHING_BLOCK, pair[1] // MATCHING_BLOCK, pair))
     step = max(50, min(MATCHING_BLOCK**2, len(ordered) // 20))
     for start in range(0, len(ordered), step):
@@ -168,7 +168,7 @@ def match_pairs(
 
 
 def forget_pairs(work: Workplace, copies: Sequence[WorkingCopy], pairs: Collection[Pair]) -> None:
-    """Removes the matches of pairs, so that they can be matched again."""
+    """Deletes the matches of pairs, so that they can be matched again."""
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
         for a, b in pairs:
@@ -179,7 +179,7 @@ def forget_pairs(work: Workplace, copies: Sequence[WorkingCopy], pairs: Collecti
 
 
 def verified_pairs(database: Any, copies: Sequence[WorkingCopy]) -> dict[Pair, int]:
-    """Matches that agree with the epipolar geometry, by pair of photos."""
+    """Number of verified matches by pair of photos."""
     rows = {image_id: row for row, image_id in enumerate(image_ids(database, copies)) if image_id is not None}
     found = {}
     for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
@@ -190,6 +190,6 @@ def verified_pairs(database: Any, copies: Sequence[WorkingCopy]) -> dict[Pair, i
 
 
 def image_ids(database: Any, copies: Sequence[WorkingCopy]) -> list[int | None]:
-    """The database's ids; None for photos that COLMAP could not read."""
+    """The photos' ids in the database; None for photos that COLMAP could not read."""
     ids = {image.name: int(image.image_id) for image in database.read_all_images()}
     return [ids.get(copy.work_name) for copy in copies]

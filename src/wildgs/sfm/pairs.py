@@ -1,7 +1,7 @@
-"""Pairs of photos to match: all of them for small sets, near neighbours for large ones, and friends of friends.
+"""Selection of image pairs: exhaustive for small sets, neighbours for large ones, and indirect neighbours.
 
-Neighbours come from GPS positions if enough photos have one, else from retrieval by VLAD descriptors (Jegou et al.,
-"Aggregating local descriptors into a compact image representation", CVPR 2010) of the SIFT features, for which no
+Neighbours are found by GPS position if enough photos have one, else by retrieval with VLAD descriptors (Jegou et
+al., "Aggregating local descriptors into a compact image representation", CVPR 2010) of SIFT features, for which no
 vocabulary has to be downloaded.
 """
 
@@ -28,26 +28,26 @@ Pair = tuple[int, int]
 EARTH_RADIUS = 6_371_000.0
 VLAD_WORDS = 64
 VLAD_FEATURES = 1000
-"""Descriptors per photo that retrieval looks at."""
+"""Number of descriptors per photo for retrieval."""
 VLAD_TRAINING = 100_000
-"""Descriptors, over all photos, from which the words are learned."""
+"""Number of descriptors, over all photos, for clustering the visual words."""
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Pairs of photos to match, as indices (low, high), sorted, without repetition."""
+    """Pairs of photos to match, sorted and unique, and how they were selected."""
 
     name: PairingName
     pairs: tuple[Pair, ...]
 
 
 def exhaustive_pairs(count: int) -> Pairing:
-    """Every photo with every other."""
+    """All pairs."""
     return Pairing("exhaustive", tuple(combinations(range(count), 2)))
 
 
 def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set[Pair]:
-    """Photos with the most similar ones, by their unit vectors; `partners` is how many to find by photo."""
+    """Pairs each photo with the most similar ones by their unit vectors; `partners` is their number by photo."""
     pairs = set()
     for photo, wanted in partners.items():
         likeness = vlads @ vlads[photo]
@@ -60,13 +60,13 @@ def alike_pairs(vlads: Float[Tensor, "N D"], partners: Mapping[int, int]) -> set
 def vlad_descriptors(
     count: int, read_descriptors: Callable[[int], Shaped[np.ndarray, "F 128"]], seed: int = 0
 ) -> Float[Tensor, "N D"]:
-    """One unit vector a photo: SIFT residuals from the nearest words, normalised per word.
+    """One unit vector per photo: SIFT residuals from the nearest visual words, normalised per word.
 
     Args:
         count: Number of photos.
-        read_descriptors: SIFT descriptors of a photo, the most reliable first (COLMAP sorts by scale); may be
-            empty.
-        seed: Of the training of the visual words.
+        read_descriptors: Returns the SIFT descriptors of a photo, most reliable first (COLMAP sorts by scale); may
+            be empty.
+        seed: Random seed of the clustering of visual words.
     """
     generator = torch.Generator().manual_seed(seed)
     share = max(1, VLAD_TRAINING // max(count, 1))
@@ -115,17 +115,17 @@ def _vlad(features: Float[Tensor, "F 128"], words: Float[Tensor, "K 128"]) -> Fl
 def near_pairs(
     positions: Mapping[int, tuple[float, float]], neighbours: int, max_distance: float
 ) -> set[Pair]:
-    """Photos with the nearest ones.
+    """Pairs each photo with the nearest ones by GPS position.
 
     Args:
-        positions: Latitude and longitude in degrees, of the photos that carry them.
-        neighbours: Partners looked up for each photo.
-        max_distance: Photos farther apart than this, in metres, are no partners.
+        positions: Latitude and longitude in degrees of the photos that have them.
+        neighbours: Number of neighbours per photo.
+        max_distance: Largest distance of neighbours, metres.
     """
     photos = sorted(positions)
     if len(photos) < 2:
         return set()
-    # On the sphere the chord stands for the distance: no seam at the date line, none at the poles.
+    # Distances in 3D, which have no discontinuities at the date line and the poles.
     angles = np.radians(np.array([positions[photo] for photo in photos], dtype=np.float64))
     latitude, longitude = angles[:, 0], angles[:, 1]
     places = EARTH_RADIUS * np.stack(
@@ -143,12 +143,13 @@ def near_pairs(
 
 
 def friends_of_friends(photos: Iterable[int], matched: Mapping[Pair, int], limit: int) -> set[Pair]:
-    """Photos with those that match their partners: what retrieval overlooks, a common partner knows.
+    """Pairs photos with those that share a matching photo, which retrieval may have missed.
 
     Args:
-        photos: For whom partners are sought.
-        matched: Number of matches of the pairs that were verified.
-        limit: Partners per photo; those come first whose weaker link to a common partner is the strongest.
+        photos: Photos to find partners for.
+        matched: Number of matches of verified pairs.
+        limit: Upper bound on new partners per photo, ordered by the number of matches of the weaker of the two
+            links.
     """
     partners: dict[int, dict[int, int]] = defaultdict(dict)
     for (a, b), matches in matched.items():
@@ -167,14 +168,14 @@ def friends_of_friends(photos: Iterable[int], matched: Mapping[Pair, int], limit
 def choose_pairs(
     vlads: Float[Tensor, "N D"], positions: Mapping[int, tuple[float, float]], config: PairingConfig
 ) -> Pairing:
-    """All pairs of a small set; of a large one, each photo with its neighbours by GPS or by retrieval.
+    """Selects all pairs of a small set, or each photo's neighbours by GPS or retrieval of a large one.
 
-    With GPS, a quarter of the partners still come from retrieval, because photos of one building from two squares
-    are far apart; photos without a near neighbour get all of their partners by it.
+    With GPS, a quarter of the neighbours are still found by retrieval, because photos of the same building may be
+    taken far apart; photos without GPS neighbours get all of them by retrieval.
 
     Args:
-        vlads: Of all photos.
-        positions: Latitude and longitude in degrees of the photos that carry them.
+        vlads: VLAD descriptors of all photos.
+        positions: Latitude and longitude in degrees of the photos that have them.
         config: Limits.
     """
     count = len(vlads)

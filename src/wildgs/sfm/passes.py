@@ -1,4 +1,4 @@
-"""The passes of structure from motion: first the common case, then more for the photos that it leaves out."""
+"""The passes of structure from motion; the second and third register photos that the first one leaves out."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
 ENOUGH_MATCHES = 60
-"""Pairs with so many are not matched again."""
+"""Number of matches from which a pair is not matched again."""
 
 POINT_ROUNDS = 3
-"""Photos that were placed by matches to points bring points for others: so many times."""
+"""Rounds of matching to points, since newly registered photos add points for others."""
 
 LEAST_POINTS = 10
-"""Sparse points of a photo that a second chance placed."""
+"""Smallest number of sparse points of a photo registered by a later pass."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Poses:
     """Result of all passes.
 
     Attributes:
-        models: All models, the kept one first.
-        pairing: Pairs that were matched.
-        passes: The pass that placed a photo, by name of its working copy, where it was not the first.
-        findings: What else was found out about photos.
+        models: All models; the first one is kept.
+        pairing: The matched pairs.
+        passes: The pass that registered a photo, if not the first, by name of its working copy.
+        findings: Further findings about photos.
     """
 
     models: list[Any]
@@ -58,10 +58,9 @@ class Poses:
 def find_poses(
     work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress
 ) -> Poses | None:
-    """Features, matches and poses of the working copies; None where no two photos match.
+    """Computes features, matches and poses of the working copies; None if no photos match.
 
-    What an interrupted call has done is taken from the workplace: features and matches from the database, and the
-    models of the first pass.
+    Features, matches and models of the first pass of an interrupted call are reused from the workplace.
     """
     extract(work, copies, config, progress)
     progress("choosing pairs", 0, 0)
@@ -90,10 +89,10 @@ def _try_again(
     config: SfmConfig,
     progress: Progress,
 ) -> tuple[list[Any], set[Pair]]:
-    """The second and third pass.
+    """Runs the second and third pass.
 
     Returns:
-        All models, and the pairs that were matched again; `passes` notes which photos were placed.
+        All models, and the pairs that were matched again; registered photos are added to `passes`.
     """
     if models:
         models = _place_by_points(work, copies, vlads, models, passes, "second", config, progress)
@@ -126,7 +125,7 @@ def _place_by_points(
     config: SfmConfig,
     progress: Progress,
 ) -> list[Any]:
-    """The models, the first with the photos that matches to its points place; these bring points for others."""
+    """Registers further photos in the first model by matching them to its points, repeatedly."""
     main = models[0]
     show = counter(progress, "matching to points")
     for _ in range(POINT_ROUNDS):
@@ -147,7 +146,7 @@ def _more_pairs(
     crops: Mapping[int, int],
     config: SfmConfig,
 ) -> set[Pair]:
-    """Partners for the photos without a pose, by looks and by common partners, that do not match well already."""
+    """Further pairs for photos without a pose, by retrieval and shared matches, without those that match well."""
     kept = [photo for photo in range(len(copies)) if photo not in crops]
     missing = set(missing_from(models[0], copies)) if models else set(kept)
     with closing(pycolmap.Database.open(work.database)) as database:
@@ -173,7 +172,7 @@ def _note_new(before: Any, after: Any, passes: dict[str, PassName], name: PassNa
 
 
 def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> None:
-    """Takes photos out that a second chance placed on few points, or against most of their matches."""
+    """Removes photos registered by a later pass with too few points or contradicted by most of their matches."""
     doubtful = find_doubtful(model, work.database, {name: name for name in _names(model)})
     for image_id in list(model.reg_image_ids()):
         image = model.image(image_id)

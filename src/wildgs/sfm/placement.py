@@ -1,4 +1,4 @@
-"""How each photo was placed, and why the others were not."""
+"""How each photo was registered, and why the others were not."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from wildgs.sfm.workplace import Workplace
 PassName = Literal["first", "second", "third"]
 
 NEIGHBOUR_POINTS = 15
-"""Points that a neighbour shares with a photo, at least."""
+"""Smallest number of points shared with a neighbour."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """How sure the pose of a photo is.
+    """Reliability of the pose of a photo.
 
     Attributes:
-        placed_by: The first pass; the second, with matches to points; or the third, with more partners and fewer
-            inliers.
-        points: Sparse points that the photo observes.
-        reprojection_error: Their mean error, pixels.
-        neighbours: Photos that share 15 points or more with it.
+        placed_by: The pass that registered it: the first; the second, by matches to points; or the third, with more
+            pairs and fewer inliers.
+        points: Number of sparse points that the photo observes.
+        reprojection_error: Their mean reprojection error, pixels.
+        neighbours: Number of photos that share at least 15 points with it.
     """
 
     placed_by: PassName
@@ -43,7 +43,7 @@ class Placement:
 def placements(
     model: Any, copies: Sequence[WorkingCopy], passes: Mapping[str, PassName]
 ) -> dict[str, Placement]:
-    """How each photo of a model was placed, by name in the scene; `passes` by name of the working copy."""
+    """The placement of each photo of a model by name in the scene; `passes` is by name of the working copy."""
     result = {}
     for copy in copies:
         image = find_registered(model, copy)
@@ -72,8 +72,8 @@ class Failure:
     """Why a photo has no pose.
 
     Attributes:
-        reason: For people.
-        partner: The photo with which it has the most matches, where there is one.
+        reason: The reason as text.
+        partner: The photo with which it has the most matches, if any.
     """
 
     reason: str
@@ -82,11 +82,11 @@ class Failure:
 
 @dataclass(frozen=True)
 class Findings:
-    """What the steps of mapping found out about photos.
+    """Findings about photos during mapping.
 
     Attributes:
-        crops: From copies and crops to their original, as indices of photos.
-        lenses: From working names to what is wrong with the lens.
+        crops: Originals of copies and crops, as indices of photos.
+        lenses: Problems of lenses, by name of the working copy.
     """
 
     crops: Mapping[int, int] = field(default_factory=dict)
@@ -96,7 +96,7 @@ class Findings:
 def failures(
     work: Workplace, copies: Sequence[WorkingCopy], models: Sequence[Any], findings: Findings
 ) -> dict[str, Failure]:
-    """Why the photos without a pose in the kept model, the first, have none; by their names."""
+    """Reasons why photos have no pose in the first model, by name."""
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
         found = verified_pairs(database, copies)
@@ -133,13 +133,15 @@ def _reason(
     if other is not None:
         members = [c.name for c in copies if c is not copy and find_registered(other, c) is not None]
         return (
-            f"belongs to a separate group of {other.num_reg_images()} photos (with {', '.join(members[:3])}), which"
-            " too little connects with the others: photos from between would"
+            f"belongs to a separate group of {other.num_reg_images()} photos (with {', '.join(members[:3])}) with"
+            " too few matches to the others; photos taken in between would connect them"
         )
     if row in findings.crops:
         return f"a copy or crop of {copies[findings.crops[row]].name}, which has no pose"
     if inliers == 0:
         return "matches no other photo"
     if find_registered(models[0], copies[partner]) is None:
-        return f"its best partner, {copies[partner].name} ({inliers} matches), has no pose either"
-    return f"too few matches agree with the scene ({inliers} at best, with {copies[partner].name})"
+        return (
+            f"the photo that it matches best, {copies[partner].name} ({inliers} matches), has no pose either"
+        )
+    return f"too few matches with the scene ({inliers} at most, with {copies[partner].name})"

@@ -1,9 +1,9 @@
-"""The second pass: features of a photo without a pose are matched to the points of the model instead of to photos.
+"""The second pass: matches features of photos without a pose to the points of the model instead of to photos.
 
-A point carries the descriptors of all photos that observe it, so that one of them is likely to resemble the new
-view, and Lowe's ratio compares points, not features: the same place in another photo is no rival. Poses of photos
-of other places reach 7 inliers, those of photos that pairs of photos left out 18 to 24. The idea of matching to
-points is that of Li et al., "Location recognition using prioritized feature matching", ECCV 2010.
+A point has the descriptors of all photos that observe it, one of which is likely to be similar to the new view, and
+Lowe's ratio test compares different points. Photos of other places have up to 7 inliers, photos that the first pass
+left out 18 to 24. Matching to points was proposed by Li et al., "Location recognition using prioritized feature
+matching", ECCV 2010.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
 RATIOS = (0.85, 0.9)
-"""Of Lowe's test, the strict one first."""
+"""Ratios of Lowe's test, the strict one first."""
 
 MAX_PHOTOS = 100
-"""Photos of the model whose descriptors are searched: those most alike."""
+"""Upper bound on the number of photos whose descriptors are searched, the most similar ones."""
 
 
 def match_to_points(
@@ -41,18 +41,18 @@ def match_to_points(
     seed: int,
     progress: Counter,
 ) -> list[str]:
-    """Writes the matches of photos without a pose that a pose explains to the database, as matches between photos.
+    """Writes inlier matches of photos without a pose to the database, as matches between photos.
 
     Args:
-        work: Its database holds features, and takes the matches.
+        work: The workplace; its database contains the features, and the matches are written to it.
         copies: All photos.
-        vlads: Of all photos.
-        model: The model so far.
-        seed: Of RANSAC.
-        progress: Called with (photos tried, photos in all).
+        vlads: VLAD descriptors of all photos.
+        model: The current model.
+        seed: Random seed of RANSAC.
+        progress: Called with (photos tried, total number of photos).
 
     Returns:
-        Working names of the photos for which a pose was found.
+        Names of the working copies for which a pose was found.
     """
     missing = missing_from(model, copies)
     found = []
@@ -86,7 +86,7 @@ def _observed(database: Any, image: Any) -> Observed:
 
 
 def _index_points(model: Any, observed: Sequence[Observed]) -> tuple[FeatureIndex, Int64[np.ndarray, " P"]]:
-    """Index of the points that some images observe, and the points' ids."""
+    """Feature index of the points that some images observe, and the points' ids."""
     unique, owners = np.unique(np.concatenate([ids for _, ids in observed]), return_inverse=True)
     places = np.array([model.point3D(point).xyz for point in unique], np.float64).reshape(-1, 3)
     descriptors = np.concatenate([descriptors for descriptors, _ in observed])
@@ -96,19 +96,19 @@ def _index_points(model: Any, observed: Sequence[Observed]) -> tuple[FeatureInde
 def _solve_photo(
     database: Any, image_id: int, seen: tuple[FeatureIndex, Int64[np.ndarray, " P"]], seed: int
 ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]] | None:
-    """Features and ids of the points that agree with a pose, None where none is sure.
+    """Features and ids of the inlier points of a pose; None without a reliable pose.
 
-    The camera in the database gets the pose's focal length, from which mapping starts.
+    The pose's focal length is written to the camera in the database, as the initial value for mapping.
     """
     index, point_ids = seen
     descriptors = np.array(database.read_descriptors(image_id).data)
     keypoints = database.read_keypoints(image_id)[:, :2].astype(np.float64)
-    known = database.read_camera(database.read_image(image_id).camera_id)
+    stored = database.read_camera(database.read_image(image_id).camera_id)
     for ratio in RATIOS:
         features, points = match_features(descriptors, index, ratio)
-        camera = pycolmap.Camera(known.todict())
+        camera = pycolmap.Camera(stored.todict())
         answer = solve_pose(
-            keypoints[features], index.points[points], camera, known.has_prior_focal_length, seed
+            keypoints[features], index.points[points], camera, stored.has_prior_focal_length, seed
         )
         if answer is not None and answer["num_inliers"] >= MIN_INLIERS:
             camera.params = [*camera.params[:3], 0.0]
@@ -125,7 +125,7 @@ def _write_matches(
     points: Int64[np.ndarray, " M"],
     model: Any,
 ) -> None:
-    """A feature that shows a point matches the features of all photos that observe it."""
+    """Writes a match between each feature and all observations of its point in other photos."""
     pairs: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for feature, point in zip(features.tolist(), points.tolist(), strict=True):
         for element in model.point3D(point).track.elements:

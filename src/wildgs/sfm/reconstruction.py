@@ -1,4 +1,4 @@
-"""`reconstruct`: a folder of photos becomes a COLMAP scene (structure from motion with pycolmap)."""
+"""`reconstruct`: creates a COLMAP scene from a folder of photos by structure from motion with pycolmap."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from wildgs.sfm.workplace import Workplace, open_workplace
 
 SCENE_PARTS = ("images", "sparse", "masks", PICTURES, REPORT_NAME)
 ASIDE, MOVED, DONE = ".replaced", ".moved", ".done"
-"""Folder of the old scene while the new one takes its place, and the files in it that say that the old scene is
-complete there, and that the new one is in its place."""
+"""Folder of the old scene during its replacement, and marker files in it: the old scene has been moved completely,
+and the new one is in place."""
 
 
 def reconstruct(
@@ -45,22 +45,22 @@ def reconstruct(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> SfmReport:
-    """Find the cameras of a folder of photos and write a scene that `load_scene` reads.
+    """Estimates the cameras of a folder of photos and writes a scene for `load_scene`.
 
-    Every photo gets a camera of its own (as tourists have), features are SIFT, mapping is incremental with two
-    more passes for what it leaves out (`wildgs.sfm.passes`), and the largest model is kept and undistorted. CUDA is
-    used where pycolmap was built with it. SIGTERM and SIGHUP end the work as Ctrl-C does. What an interrupted call
-    has done lies in a hidden folder beside the output, and the same call continues there.
+    Every photo has its own camera, features are SIFT, mapping is incremental with two additional passes
+    (`wildgs.sfm.passes`), and the largest model is kept and undistorted. CUDA is used if pycolmap was built with
+    it. SIGTERM and SIGHUP interrupt the work like Ctrl-C. Intermediate results are kept in a hidden folder beside
+    the output, so that the same call continues after an interruption.
 
     Args:
-        photos: Folder of photos, sub-folders included. It is only read.
-        output: Scene folder to write: `images/`, `sparse/0/`, `masks/` where photos have transparent pixels,
-            and `sfm_report.json`. It appears only when all is done.
-        config: Limits; the defaults where None.
-        overwrite: Replace the scene that an earlier run left in `output`. The old scene stays until the new one is
-            complete. Its depth, and masks that were added to it, do not fit the new photos and are renamed to
-            `depth_replaced/` and `masks_replaced/`.
-        progress: Called with every step.
+        photos: Folder of photos, searched with its sub-folders and not modified.
+        output: Scene folder to write: `images/`, `sparse/0/`, `masks/` if photos have transparent pixels, and
+            `sfm_report.json`. It is created when everything is done.
+        config: Options; None for the defaults.
+        overwrite: Replace an existing scene in `output` once the new one is complete. Its depth maps, and masks
+            that were added to it, do not fit the new photos and are renamed to `depth_replaced/` and
+            `masks_replaced/`.
+        progress: Called during all steps.
 
     Returns:
         Which photos were registered, and why the others were not.
@@ -86,15 +86,15 @@ def _reconstruct(
         copies, broken = _copy(work, photos, config, progress)
         if len(copies) < 2:
             raise UserError(
-                f"{photos}: holds {len(copies)} photo(s) that can be read; poses need at least two of the"
-                " same place, better twenty"
+                f"{photos}: contains {len(copies)} readable photo(s); at least two of the same place are needed,"
+                " better twenty"
             )
         pycolmap.set_random_seed(config.seed)
         poses = find_poses(work, copies, config, progress)
         if poses is None:
             raise UserError(
-                f"{photos}: the {len(copies)} photos do not match each other, so they have no poses; photos of one"
-                " place with much overlap are needed"
+                f"{photos}: the {len(copies)} photos do not match each other; give photos of one place with much"
+                " overlap"
             )
         model = poses.models[0]
         progress("undistorting", 0, 0)
@@ -119,7 +119,7 @@ def _reconstruct(
             doubtful={names[n]: why for n, why in find_doubtful(model, work.database, names).items()},
         )
         report.write(work.scene)
-        _check_output(photos, output, overwrite)  # another process may have been faster
+        _check_output(photos, output, overwrite)  # again, as another process may have written to it
         _move_in(work.scene, output)
     return report
 
@@ -127,7 +127,7 @@ def _reconstruct(
 def _copy(
     work: Workplace, photos: Path, config: SfmConfig, progress: Progress
 ) -> tuple[list[WorkingCopy], dict[str, str]]:
-    """The working copies, those of an interrupted reconstruction where they are complete."""
+    """Makes the working copies, or reuses those of an interrupted call if they are complete."""
     kept = work.load_copies()
     if kept is not None:
         return kept
@@ -143,32 +143,32 @@ def _copy(
 
 
 def check_photos(photos: Path, output: Path) -> None:
-    """Refuses a folder that does not exist, and an output in it, whose pictures would be taken for photos later.
+    """Checks the folder of photos, and that the output is outside it (its images would be taken as photos).
 
     Args:
         photos: Folder of photos.
-        output: Where a scene or run is to be written.
+        output: The scene or run folder to write.
 
     Raises:
-        UserError: There is no such folder, or the output lies in it.
+        UserError: The folder does not exist, or the output is in it.
     """
     if not photos.is_dir():
-        raise UserError(f"{photos}: no such folder; give the folder that holds the photos")
+        raise UserError(f"{photos}: no such folder; give the folder of the photos")
     place, folder = output.resolve(), photos.resolve()
     if place.is_relative_to(folder):
         raise UserError(
-            f"{output}: lies in the folder of the photos, {photos}, whose sub-folders are searched for photos; "
+            f"{output}: is inside the folder of the photos, {photos}, whose sub-folders are searched for photos; "
             "choose another --output"
         )
 
 
 @contextmanager
 def _writing(output: Path) -> Iterator[None]:
-    """Reports a disk that is full or cannot be written to as a user's mistake."""
+    """Converts errors of writing to `UserError`."""
     try:
         yield
     except (OSError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "disk is full" not in str(error):  # so SQLite says it
+        if isinstance(error, RuntimeError) and "disk is full" not in str(error):  # SQLite's message
             raise
         raise UserError(
             f"{output} cannot be written ({error}); free disk space, fix permissions or choose another --output"
@@ -176,7 +176,7 @@ def _writing(output: Path) -> Iterator[None]:
 
 
 def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
-    """Never overwrite photos or models that another program, or the user, put there."""
+    """Checks that no photos or models of the user or of other programs would be overwritten."""
     if output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file; give a folder for the scene")
     folders = ("images", "masks", *(sparse for sparse, _ in LAYOUTS))
@@ -184,11 +184,11 @@ def _check_output(photos: Path, output: Path, overwrite: bool) -> None:
     if not taken:
         return
     if photos.resolve().is_relative_to(output.resolve()):
-        raise UserError(f"{output}: the photos lie in this folder, which would be overwritten; give another")
+        raise UserError(f"{output}: the photos are in this folder, which would be overwritten; give another")
     if not (output / REPORT_NAME).is_file():
-        raise UserError(f"{output}: holds {taken[0]}/ that `wildgs sfm` did not make; give another folder")
+        raise UserError(f"{output}: contains {taken[0]}/ not made by `wildgs sfm`; give another folder")
     if not overwrite:
-        raise UserError(f"{output}: already holds a scene; give another folder, or --overwrite")
+        raise UserError(f"{output}: already contains a scene; give another folder, or --overwrite")
 
 
 def _is_renamed(copy: WorkingCopy) -> bool:
@@ -202,9 +202,9 @@ def _files_in(folder: Path) -> tuple[str, ...]:
 
 
 def _move_in(scene: Path, output: Path) -> None:
-    """Put the finished scene in its place; other files in `output` stay.
+    """Moves the finished scene to `output`, keeping other files there.
 
-    If that fails half-way, the old scene is put back; if the process is killed, by the next call's `_restore`.
+    If that fails, the old scene is restored; if the process is killed, the next call restores it.
     """
     output.mkdir(exist_ok=True)
     aside = output / ASIDE
@@ -214,7 +214,7 @@ def _move_in(scene: Path, output: Path) -> None:
             if (output / name).exists():
                 (output / name).rename(aside / name)
         (aside / MOVED).touch()
-        # The report first: with it, what a killed process leaves is known as a scene of `wildgs sfm`.
+        # The report first, which marks the folder as a scene of `wildgs sfm` if the process is killed.
         for item in sorted(scene.iterdir(), key=lambda item: item.name != REPORT_NAME):
             item.rename(output / item.name)
     except BaseException:
@@ -226,14 +226,14 @@ def _move_in(scene: Path, output: Path) -> None:
     if kept:
         warnings.warn(
             f"{output}: {' and '.join(kept)} belonged to the replaced scene and may not fit the new one; delete"
-            " what is no longer needed",
+            " them if they are no longer needed",
             WildGSWarning,
             stacklevel=3,
         )
 
 
 def _restore(output: Path) -> None:
-    """Put back the scene that a killed or failed replacement left aside."""
+    """Restores the old scene after a failed or killed replacement."""
     aside = output / ASIDE
     if not aside.is_dir():
         return
@@ -241,14 +241,14 @@ def _restore(output: Path) -> None:
         if (aside / MOVED).exists():
             for new in (output / name for name in SCENE_PARTS):
                 shutil.rmtree(new) if new.is_dir() else new.unlink(missing_ok=True)
-            (aside / MOVED).unlink()  # first: what is put back from here on is not the new scene's
+            (aside / MOVED).unlink()  # first, since files restored from here on are those of the old scene
         for item in aside.iterdir():
             item.replace(output / item.name)
     shutil.rmtree(aside)
 
 
 def _not_made_here(aside: Path) -> list[str]:
-    """Parts of a replaced scene that `reconstruct` did not write: depth, and masks that somebody added."""
+    """Parts of a replaced scene that `reconstruct` did not write: depth maps and added masks."""
     names = ["depth"] if (aside / "depth").is_dir() else []
     if set(_files_in(aside / "masks")) - set(read_masks(aside)):
         names.append("masks")
@@ -256,7 +256,7 @@ def _not_made_here(aside: Path) -> list[str]:
 
 
 def _keep(folder: Path, output: Path) -> str:
-    """Move a folder of the replaced scene beside the new one's; its new name."""
+    """Renames a folder of the replaced scene; returns its new name."""
     number, target = 1, output / f"{folder.name}_replaced"
     while target.exists():
         number += 1
@@ -266,7 +266,7 @@ def _keep(folder: Path, output: Path) -> str:
 
 
 def _write_scene(work: Workplace, copies: Sequence[WorkingCopy], model: Any) -> None:
-    """Undistort the photos of the model and give them their names back."""
+    """Undistorts the photos of the model and restores their names."""
     kept, dense = work.fresh("kept"), work.fresh("dense")
     work.fresh("scene")
     model.write(kept)

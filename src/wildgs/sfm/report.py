@@ -1,4 +1,4 @@
-"""The result of structure from motion on a folder of photos, for people and for programs."""
+"""The report of structure from motion: as text, and as JSON."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class SfmReport:
     Attributes:
         photos: Number of photos found.
         registered: Names in the scene of the photos with a pose.
-        left_out: From the names of the other photos to the likely reason.
-        renamed: From the names of photos to their names in the scene, where these differ in more than the ending.
+        left_out: Likely reasons why the other photos have no pose, by name.
+        renamed: Names in the scene that differ from the photo's in more than the extension, by the photo's name.
         masks: Files in the scene's `masks/` that were written with it.
         points: Number of sparse points.
-        reprojection_error: Mean over the points, pixels.
-        pairing: How the pairs to match were chosen.
-        pairs: How many pairs were matched.
-        models: Sizes of all models found, largest first; the first is kept.
-        seconds: Time taken.
-        placed: How sure each pose is, by name in the scene.
-        copies: From copies and crops of a photo to the photo.
-        doubtful: From the names of photos with a pose to what contradicts it.
-        pictures: From the names of photos without a pose to pictures of their best matches, files of the scene.
+        reprojection_error: Mean reprojection error of the points, pixels.
+        pairing: How pairs were selected.
+        pairs: Number of matched pairs.
+        models: Sizes of all models, largest first; the first is kept.
+        seconds: Computing time.
+        placed: Reliability of each pose, by name in the scene.
+        copies: Originals of copies and crops, by name.
+        doubtful: Reasons why poses are doubtful, by name.
+        pictures: Image files of the best matches of photos without a pose, by name.
     """
 
     photos: int
@@ -55,7 +55,7 @@ class SfmReport:
     pictures: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """The report in plain sentences."""
+        """The report as text."""
         text = [
             f"{len(self.registered)} of {self.photos} photos registered, {self.points} points,"
             f" {self.reprojection_error:.2f} px mean reprojection error"
@@ -63,17 +63,17 @@ class SfmReport:
         ]
         later = [name for name, how in self.placed.items() if how.placed_by != "first"]
         if later:
-            text.append(f"{len(later)} of them at a second or third chance: {_some(later)}")
+            text.append(f"{len(later)} of them by the second or third pass: {_some(later)}")
         if self.copies:
             text.append(
                 f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"
             )
         if self.doubtful:
-            text.append(f"{len(self.doubtful)} poses are doubtful (look-alikes, or wrong):")
+            text.append(f"{len(self.doubtful)} poses are doubtful (wrong, or photos of look-alikes):")
             text += [f"  {printable(name)}: {why}" for name, why in sorted(self.doubtful.items())]
         if self.left_out:
             text.append(
-                f"{len(self.left_out)} photos have no pose and take no part; the others are not affected:"
+                f"{len(self.left_out)} photos have no pose and are not used; the others are not affected:"
             )
             text += [f"  {printable(name)}: {reason}" for name, reason in sorted(self.left_out.items())]
         if self.renamed:
@@ -82,9 +82,9 @@ class SfmReport:
         return text
 
     def write(self, folder: Path) -> None:
-        """Write the report as `sfm_report.json`."""
+        """Writes the report as `sfm_report.json`."""
         text = json.dumps(asdict(self), indent=2, ensure_ascii=False)
-        # Bytes that are not UTF-8 become JSON's own escapes, from which `read` gets them back.
+        # Bytes that are not UTF-8 are written as JSON escapes.
         (folder / REPORT_NAME).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -93,14 +93,14 @@ def _some(names: Sequence[str]) -> str:
 
 
 def read_masks(folder: Path) -> list[str]:
-    """The masks that an earlier report lists; none if there is no report, or an older one without the list."""
+    """The masks listed in an earlier report; none if there is no report or no list."""
     masks = _read(folder).get("masks", [])
     return [str(name) for name in masks] if isinstance(masks, list) else []
 
 
 @dataclass(frozen=True)
 class LeftOutPhoto:
-    """A photo without a pose, the reason, and the picture of its best matches, where there is one."""
+    """A photo without a pose, the reason, and the image of its best matches, if there is one."""
 
     name: str
     reason: str
@@ -108,7 +108,7 @@ class LeftOutPhoto:
 
 
 def read_left_out(folder: Path) -> list[LeftOutPhoto]:
-    """The photos without a pose that the report of a scene lists, with their pictures."""
+    """The photos without a pose in the report of a scene."""
     record = _read(folder)
     reasons, pictures = record.get("left_out", {}), record.get("pictures", {})
     if not isinstance(reasons, dict) or not isinstance(pictures, dict):
@@ -121,20 +121,20 @@ def read_left_out(folder: Path) -> list[LeftOutPhoto]:
 
 
 def describe_placed(folder: Path) -> str:
-    """A sentence on how the photos of a scene were placed, empty where its report does not say."""
+    """A summary of how the photos of a scene were registered; empty without a report."""
     record = _read(folder)
     try:
         placed, doubtful = record["placed"], record.get("doubtful", {})
         later = sum(how["placed_by"] != "first" for how in placed.values())
         weakest = sorted(placed, key=lambda name: placed[name]["points"])[:3]
         least = ", ".join(f"{printable(name)} ({placed[name]['points']} points)" for name in weakest)
-    except (KeyError, TypeError, AttributeError):  # of an earlier version, or damaged
+    except (KeyError, TypeError, AttributeError):  # report of an earlier version, or damaged
         return ""
     if not placed:
         return ""
     return (
-        f"{len(placed)} photos have a pose, {later} of them by a second or third chance; {len(doubtful)} are"
-        f" doubtful. The least sure: {least}."
+        f"{len(placed)} photos have a pose, {later} of them by the second or third pass; {len(doubtful)} are"
+        f" doubtful. Least reliable: {least}."
     )
 
 

@@ -1,4 +1,4 @@
-"""Working copies of photos that every later step can read: upright, 8-bit, with plain names."""
+"""Working copies of photos for structure from motion: upright, 8-bit, with simple names."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ SUFFIXES = {
     ".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff", ".webp", ".bmp", ".gif",
     ".jp2", ".j2k", ".jpx", ".ppm", ".pgm", ".pnm", ".heic", ".heif", ".avif",
 }  # fmt: skip
-"""File names of photos; files without an ending are photos if they begin like one."""
+"""Extensions of photos; files without extension are recognised by their content."""
 MAX_NAME_BYTES = 240
-"""Of a photo's name in the scene: masks add an ending to it, and file systems take 255 bytes."""
+"""Longest name of a photo in the scene; masks add an extension, and file systems allow 255 bytes."""
 JPEG_QUALITY = 97
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 COPIERS = 4
-"""Threads that decode and copy; Pillow works without Python's lock."""
+"""Number of threads that decode and copy; Pillow releases the GIL."""
 
 
 @dataclass(frozen=True)
 class WorkingCopy:
-    """A photo as structure from motion reads it.
+    """A working copy of a photo.
 
     Attributes:
         name: Path of the original within the folder of photos.
-        work_name: File name of the copy: digits only, because COLMAP's pair lists end a name at a space.
-        scene_name: Path of the photo in the scene: the original's, as .jpg, without characters that COLMAP models
-            or other systems cannot hold; unique by its stem.
-        masked: Whether the photo's transparent pixels were written as a mask beside the copy.
-        position: Latitude and longitude by GPS in degrees, None where the photo carries none.
+        work_name: File name of the copy, digits only, because names in COLMAP's pair lists end at a space.
+        scene_name: Path of the photo in the scene: the original's as .jpg, without characters that COLMAP models or
+            other systems do not support; with a unique stem.
+        masked: Whether a mask of the photo's transparent pixels was written.
+        position: GPS latitude and longitude in degrees; None if unknown.
     """
 
     name: str
@@ -59,15 +59,15 @@ class WorkingCopy:
 
 
 def list_photos(folder: Path) -> list[str]:
-    """Photos in a folder and its sub-folders, as sorted paths relative to it; hidden files are skipped.
+    """Photos in a folder and its sub-folders, as sorted relative paths; hidden files are skipped.
 
-    A warning names the files that are not taken for photos.
+    Warns of files that are not photos.
 
     Raises:
-        UserError: There is no such folder, or no photo in it.
+        UserError: The folder does not exist or contains no photos.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; give the folder that holds the photos")
+        raise UserError(f"{folder}: no such folder; give the folder of the photos")
     names, others = [], []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -78,7 +78,7 @@ def list_photos(folder: Path) -> list[str]:
         raise UserError(f"{folder}: no photos (.jpg, .png, .tif, .webp, ...) in this folder; give another")
     if others:
         warnings.warn(
-            f"{folder}: {len(others)} files are not photos by their names and are not used:"
+            f"{folder}: {len(others)} files are not photos by their extension and are not used:"
             f" {describe_names([printable(name) for name in others])}",
             WildGSWarning,
             stacklevel=2,
@@ -97,10 +97,10 @@ def _is_photo(path: Path) -> bool:
 
 
 def scene_names(names: Sequence[str]) -> list[str]:
-    r"""For each photo a name in the scene: as JPEG, no two with one stem (masks and depth go by stems).
+    r"""Names of photos in the scene: with .jpg and unique stems, which masks and depth maps share.
 
-    Names that COLMAP models cannot hold (bytes that are not UTF-8, control characters), that other systems take for
-    something else (`\`, drives) or that are too long are replaced by similar ones.
+    Names that COLMAP models do not support (bytes that are not UTF-8, control characters), that have another
+    meaning on other systems (`\`, drives) or that are too long are replaced by similar ones.
     """
     taken: set[str] = set()
     result = []
@@ -119,16 +119,16 @@ def scene_names(names: Sequence[str]) -> list[str]:
 
 
 def _folded(path: PurePosixPath) -> str:
-    """A name as file systems compare it that ignore case and how accents are composed."""
+    """A name normalised for file systems that ignore case and Unicode composition."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", str(path)).casefold())
 
 
 def _safe_part(part: str) -> str:
-    """A file or folder name that every part of a scene can hold; most names stay as they are."""
+    """Replaces unsupported characters of a file or folder name and limits its length."""
     safe = "".join("_" if is_unprintable(c) or c == "\\" else c for c in part)
     if PureWindowsPath(safe).drive:
         safe = safe.replace(":", "_", 1)
-    if len(safe.encode()) <= MAX_NAME_BYTES - 16:  # room for endings that keep names apart
+    if len(safe.encode()) <= MAX_NAME_BYTES - 16:  # leaves room for suffixes that make names unique
         return safe
     digest = hashlib.sha256(part.encode("utf-8", "surrogateescape")).hexdigest()[:12]
     ending = PurePosixPath(safe).suffix if len(PurePosixPath(safe).suffix) < 8 else ""
@@ -144,18 +144,17 @@ def copy_upright(
     max_pixels: int = MAX_IMAGE_PIXELS,
     progress: Counter | None = None,
 ) -> tuple[list[WorkingCopy], dict[str, str]]:
-    """Write upright 8-bit JPEG copies of all photos; the EXIF block (focal length, GPS) goes along.
+    """Writes upright 8-bit JPEG copies of all photos with their EXIF data (focal length, GPS).
 
     Args:
-        folder: The photos.
-        images_dir: Where the copies go; made if missing.
-        masks_dir: Where masks of transparent pixels go, named as COLMAP wants them (`<copy>.png`, 0 =
-            ignore).
-        max_pixels: Larger photos are left out.
-        progress: Called with (photos copied, photos in all).
+        folder: Folder of photos.
+        images_dir: Folder for the copies; created if missing.
+        masks_dir: Folder for masks of transparent pixels, named as in COLMAP (`<copy>.png`, 0 = ignore).
+        max_pixels: Larger photos are skipped.
+        progress: Called with (photos copied, total number of photos).
 
     Returns:
-        The copies, and the photos that could not be read with the reason (a warning names them, too).
+        The copies, and the reasons for photos that could not be read, of which it also warns.
 
     Raises:
         UserError: There are no photos.
@@ -186,12 +185,12 @@ def copy_upright(
 def _copy_one(
     source: Path, target: Path, masks_dir: Path, max_pixels: int
 ) -> tuple[bool, tuple[float, float] | None]:
-    """Copy one photo; whether a mask was written, and where the photo was taken."""
+    """Copies one photo; returns whether a mask was written, and the GPS position."""
     with open_image(source, max_pixels) as image, decoding(image):
         photo = read_photo(source, max_pixels=max_pixels)
         position = gps_position(image)
         if image.format == "JPEG" and image.mode == "RGB" and _orientation(image) == 1:
-            shutil.copyfile(source, target)  # as it is: encoding it again would lose a little
+            shutil.copyfile(source, target)  # lossless
             return False, position
         save_jpeg(Image.fromarray(photo.pixels), image, target)
         if photo.mask is None or photo.mask.all():
@@ -202,9 +201,9 @@ def _copy_one(
 
 
 def gps_position(image: Image.Image) -> tuple[float, float] | None:
-    """Latitude and longitude in degrees from the EXIF block; None where it has none that makes sense.
+    """GPS latitude and longitude in degrees from EXIF data; None if missing or invalid.
 
-    COLMAP reads positions, too, but only those with an altitude.
+    COLMAP only reads positions with an altitude.
     """
     try:
         gps = image.getexif().get_ifd(GPS_IFD)
@@ -214,30 +213,30 @@ def gps_position(image: Image.Image) -> tuple[float, float] | None:
         )
         latitude *= -1 if str(gps[1]).upper().startswith("S") else 1
         longitude *= -1 if str(gps[3]).upper().startswith("W") else 1
-    except Exception:  # absent or broken
+    except Exception:  # missing or invalid
         return None
-    sensible = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0.0, 0.0)
-    return (latitude, longitude) if sensible else None
+    valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0.0, 0.0)
+    return (latitude, longitude) if valid else None
 
 
 def save_jpeg(picture: Image.Image, original: Image.Image, target: Path) -> None:
-    """Write an upright picture with the entries of another one's EXIF block that can be read and written."""
+    """Writes an upright image with the valid EXIF entries of another one."""
     try:
-        exif = _sound_entries(original.getexif())
-    except Exception:  # a broken EXIF block costs the focal length, not the photo
+        exif = _valid_entries(original.getexif())
+    except Exception:  # invalid EXIF data is ignored
         exif = b""
     try:
         picture.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
-    except ValueError:  # more than a JPEG can hold
+    except ValueError:  # more EXIF data than a JPEG can hold
         picture.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0)
 
 
-def _sound_entries(exif: Image.Exif) -> bytes:
-    """An EXIF block without the orientation and without entries that Pillow cannot write again."""
-    sound = Image.Exif()
+def _valid_entries(exif: Image.Exif) -> bytes:
+    """EXIF data without the orientation and without entries that Pillow cannot write."""
+    valid = Image.Exif()
     for block in (None, EXIF_IFD, GPS_IFD):
         source = exif if block is None else exif.get_ifd(block)
-        target = sound if block is None else sound.get_ifd(block)
+        target = valid if block is None else valid.get_ifd(block)
         for tag, value in list(source.items()):
             if block is None and tag in (EXIF_ORIENTATION, EXIF_IFD, GPS_IFD):
                 continue
@@ -245,11 +244,11 @@ def _sound_entries(exif: Image.Exif) -> bytes:
                 alone = Image.Exif()
                 alone[tag] = value
                 alone.tobytes()
-            except Exception:  # struct.error, TypeError and more, by the entry's type
+            except Exception:  # struct.error, TypeError and others, depending on the entry's type
                 continue
             target[tag] = value
-    sound[EXIF_ORIENTATION] = 1
-    return sound.tobytes()
+    valid[EXIF_ORIENTATION] = 1
+    return valid.tobytes()
 
 
 def _orientation(image: Image.Image) -> int:

@@ -1,4 +1,4 @@
-"""Where structure from motion works: folders and a database beside the output, which survive a kill."""
+"""The working folder of structure from motion beside the output, which is kept if the process is killed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Workplace:
 
     @property
     def masks(self) -> Path:
-        """Masks of transparent pixels, by copy; absent where no photo has any."""
+        """Masks of transparent pixels of the copies; missing if no photo has any."""
         return self.root / "masks"
 
     @property
@@ -45,7 +45,7 @@ class Workplace:
 
     @property
     def scene(self) -> Path:
-        """The finished scene before it moves to its place."""
+        """The finished scene before it is moved to the output."""
         return self.root / "scene"
 
     def fresh(self, name: str) -> Path:
@@ -56,7 +56,7 @@ class Workplace:
         return folder
 
     def is_sound(self) -> bool:
-        """Whether the database can be read: COLMAP does not wait until it is on the disk, as a power cut shows."""
+        """Whether the database is intact; COLMAP does not flush it to the disk, so a power cut may damage it."""
         if not self.database.exists():
             return True
         try:
@@ -73,7 +73,7 @@ class Workplace:
             aside.write_text(json.dumps(record), encoding="utf-8")
 
     def load_copies(self) -> tuple[list[WorkingCopy], dict[str, str]] | None:
-        """The copies of an interrupted reconstruction, None where they are not complete."""
+        """The copies of an interrupted call; None if they are not complete."""
         try:
             record = read_json(self.root / "copies.json")
             if record["sizes"] != [_sizes(self.images), _sizes(self.masks)]:
@@ -87,7 +87,7 @@ class Workplace:
             return None
 
     def is_done(self, stage: str) -> bool:
-        """Whether a stage was finished, by this call or an interrupted one."""
+        """Whether a stage was finished by this call or an interrupted one."""
         return (self.root / f"{stage}.done").is_file()
 
     def set_done(self, stage: str) -> None:
@@ -95,7 +95,7 @@ class Workplace:
         (self.root / f"{stage}.done").touch()
 
     def save_models(self, name: str, models: list[pycolmap.Reconstruction]) -> None:
-        """Keeps the result of a stage of mapping."""
+        """Saves the result of a stage of mapping."""
         aside = self.fresh(f"{name}.part")
         for number, model in enumerate(models):
             (aside / str(number)).mkdir()
@@ -106,18 +106,18 @@ class Workplace:
         aside.rename(self.root / name)
 
     def load_models(self, name: str) -> list[pycolmap.Reconstruction] | None:
-        """The result of a stage of mapping that an interrupted reconstruction finished."""
+        """The saved result of a stage of mapping; None if there is none."""
         folder = self.root / name
         try:
             if not folder.is_dir() or read_json(self.root / f"{name}.json") != _sizes(folder):
-                return None  # COLMAP takes a truncated model for a smaller one
+                return None  # COLMAP would read a truncated model as a smaller one
             return [pycolmap.Reconstruction(folder / str(n)) for n in range(len(list(folder.iterdir())))]
         except (OSError, ValueError, RuntimeError):
             return None
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """Sizes of the files below a folder, which a full disk or a power cut would change."""
+    """Sizes of the files in a folder, to detect truncation by a full disk or a power cut."""
     return {
         path.relative_to(folder).as_posix(): path.stat().st_size
         for path in folder.rglob("*")
@@ -126,18 +126,18 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def work_folder(output: Path) -> Path:
-    """Where the work of an output lies while it goes on, and after it was interrupted."""
+    """The working folder for an output."""
     return output.parent / f".wildgs-sfm-{output.name}"
 
 
 @contextmanager
 def open_workplace(photos: Path, output: Path, config: SfmConfig) -> Iterator[Workplace]:
-    """The workplace of an output; the one that was left there if it began with the same photos and options.
+    """Opens the workplace of an output, reusing that of an interrupted call with the same photos and options.
 
-    It is removed when the block ends well or with a `UserError`, and kept when the work was interrupted.
+    It is removed when the block succeeds or raises `UserError`, and kept after an interruption.
 
     Raises:
-        UserError: Another process works on the same output.
+        UserError: Another process uses the same output.
     """
     folder = work_folder(output)
     lock = filelock.FileLock(output.parent / f"{folder.name}.lock", timeout=0)
@@ -145,14 +145,14 @@ def open_workplace(photos: Path, output: Path, config: SfmConfig) -> Iterator[Wo
         lock.acquire()
     except filelock.Timeout as error:
         raise UserError(
-            f"{output}: another process finds poses for it; wait for it, or give another folder"
+            f"{output}: another process is writing to it; wait for it, or give another folder"
         ) from error
     try:
         plan = _plan(photos, config)
         begun = folder.is_dir() and _read(folder / "plan") == plan
         if begun and not Workplace(folder).is_sound():
             begun = False
-            message = f"{folder}: what an interrupted call left there is damaged; beginning anew"
+            message = f"{folder}: the results of an interrupted call are damaged; starting again"
             warnings.warn(message, WildGSWarning, stacklevel=3)
         if not begun:
             shutil.rmtree(folder, ignore_errors=True)
@@ -164,7 +164,9 @@ def open_workplace(photos: Path, output: Path, config: SfmConfig) -> Iterator[Wo
             shutil.rmtree(folder, ignore_errors=True)
             raise
         except KeyboardInterrupt:
-            message = f"what was done is kept in {folder}; the same command continues, or delete that folder"
+            message = (
+                f"intermediate results are kept in {folder}; run the same command to continue, or delete it"
+            )
             warnings.warn(message, WildGSWarning, stacklevel=3)
             raise
         shutil.rmtree(folder, ignore_errors=True)
@@ -178,7 +180,7 @@ def _read(file: Path) -> str | None:
 
 
 def _plan(photos: Path, config: SfmConfig) -> str:
-    """What the work depends on: options, pycolmap, and name, size and time of every photo."""
+    """A digest of options, versions, and name, size and time of every photo."""
     digest = hashlib.sha256(f"{__version__} {pycolmap.__version__} {config}".encode())
     for name in list_photos(photos):
         stat = (photos / name).stat()
