@@ -36,6 +36,7 @@ from torch import Tensor
 from resized_demo import write_resized_demo
 from wildgs.engine.config import DensityConfig
 from wildgs.engine.team import Team
+from wildgs.engine.schedule import MASK_START
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, method_type
 from wildgs.model.wildgs import WildGSConfig
@@ -197,7 +198,7 @@ def make_trainer(
     trainer.cuda_graphs = graphs
     trainer.begin()
     schedule = trainer.schedule
-    trainer.step = schedule.first_stage + schedule.mask_pause + 1
+    trainer.step = max(schedule.first_stage + schedule.mask_pause, round(MASK_START * config.steps)) + 1
     return trainer
 
 

@@ -39,11 +39,26 @@ def test_mask_weight_falls_linearly_and_stays_in_its_range():
     assert weights == pytest.approx([0.4, 0.4, 0.25, 0.1, 0.1])
 
 
+def test_few_photos_begin_with_a_lower_mask_weight():
+    config = ObjectiveConfig(mask_weight_photos=80)
+    starts = [config.mask_weight(0.0, photos) for photos in (200, 80, 60, 40, 1)]
+    assert starts == pytest.approx([0.4, 0.4, 0.25, 0.1, 0.1])
+    assert config.mask_weight(0.5, 60) == pytest.approx(0.175)
+    assert config.mask_weight(1.0, 60) == pytest.approx(config.mask_weight_end)
+    assert ObjectiveConfig(mask_weight_photos=0).mask_weight(0.0, 1) == pytest.approx(0.4)
+
+
+def test_the_number_of_photos_decides_the_weight_in_the_total(inputs):
+    few, many = (total_loss(ObjectiveConfig(), 0.0, **inputs, num_photos=photos) for photos in (10, 100))
+    difference = many.total - few.total
+    assert difference.item() == pytest.approx(0.3 * few.mask.item(), rel=1e-4)
+
+
 def test_total_is_the_weighted_sum_of_its_terms(inputs):
     config = ObjectiveConfig(depth_weight=0.3)
     losses = total_loss(config, 0.5, **inputs)
     selection = (inputs["visibility"] > 0.5) & (inputs["alpha"] > 0.5)
-    image = masked_photometric(inputs["photo"], inputs["render"], inputs["visibility"], 0.8)
+    image = masked_photometric(inputs["photo"], inputs["render"], inputs["visibility"], 0.8, power=3.0)
     mask = visibility_regularizer(inputs["visibility"])
     depth = depth_correlation(inputs["depth"], inputs["disparity"], selection)
     assert losses.as_floats() == pytest.approx(
@@ -108,7 +123,7 @@ def test_the_masks_gradient_as_printed_is_that_of_the_formula(inputs):
     printed = 0.8 * (photo * mask - render * mask).abs().mean() + 0.2 * (1 - similarity)
     expected = torch.autograd.grad(printed + 0.4 * (1 - visibility).square().mean(), [visibility, render])
     plain = {"photo": inputs["photo"], "render": inputs["render"], "visibility": inputs["visibility"]}
-    losses = total_loss(ObjectiveConfig(mask_gradient="loss"), 0.0, **plain)
+    losses = total_loss(ObjectiveConfig(mask_gradient="loss", mask_power=1.0), 0.0, **plain)
     found = torch.autograd.grad(losses.total, [inputs["visibility"], inputs["render"]])
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other.float(), atol=1e-7, rtol=1e-3)

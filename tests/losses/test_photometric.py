@@ -149,6 +149,21 @@ def test_a_learning_mask_changes_neither_value_nor_the_renders_gradient():
     torch.testing.assert_close(results[0], results[1])
 
 
+def test_a_power_of_the_mask_weights_doubtful_pixels_less():
+    photo, render = pictures(20, 14)
+    visibility = torch.rand(20, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    results = []
+    for mask, power in ((visibility, 3.0), (visibility**3, 1.0)):
+        leaf = render.clone().requires_grad_()
+        loss = masked_photometric(photo, leaf, mask, power=power)
+        loss.backward()
+        results.append((loss.detach(), leaf.grad))
+    torch.testing.assert_close(results[0], results[1])
+    mask = visibility.clone().requires_grad_()
+    masked_photometric(photo, render, mask, power=3.0).backward()
+    torch.testing.assert_close(mask.grad, transient_evidence(photo, render) / (20 * 14))
+
+
 def test_a_photo_that_is_wrong_everywhere_is_not_hidden():
     """Nothing rendered yet: the mask must not learn to hide it all."""
     visibility = torch.full((20, 14), 0.9, dtype=torch.float64, requires_grad=True)

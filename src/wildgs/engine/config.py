@@ -26,7 +26,8 @@ class ScheduleConfig:
             spike in the loss for a transient.
         sh_every: Steps between increases of the active SH degree (3DGS: 1,000).
         encoder_every: Train the image encoder every n-th step (not scaled; paper: 1).
-        mask_every: Train the visibility mask every n-th step (not scaled; paper: 1).
+        mask_every: Train the visibility mask every n-th step (not scaled; paper: 1), after the first 30% of the run,
+            where it learns on every step.
         planes_every: Train the triplane's UNet every n-th step (not scaled; paper: 1).
     """
 
@@ -101,6 +102,7 @@ class DensityConfig:
         grow_error: Strategy relocation: do not split Gaussians that cover less error (sum over pixels, mean over
             the photos that see them).
         least_pixels: Strategy relocation: prune Gaussians that cover fewer pixels in every photo.
+        min_visibility: Strategy relocation: ignore the error of pixels whose visibility M is not above this.
         max_gaussians: Upper bound on the number of Gaussians, initial ones included.
     """
 
@@ -116,6 +118,7 @@ class DensityConfig:
     grow_share: float = 0.1
     grow_error: float = 0.02
     least_pixels: float = 1.0
+    min_visibility: float = 0.8
     max_gaussians: int = 3_000_000
 
 

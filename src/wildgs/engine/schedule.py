@@ -20,6 +20,10 @@ _FLOORS = {
 _FLOOR_SHARE = 5
 """Such a smallest step count is at most this part (one fifth) of a run."""
 
+MASK_START = 0.3
+"""Fraction of a run in which the mask learns on every step, before `mask_every` takes effect. Otherwise the Gaussians
+learn passers-by before the mask does."""
+
 
 class Schedule:
     """The schedule of one run."""
@@ -67,7 +71,8 @@ class Schedule:
         """The stage at a step (from 0) that counts as `taken` steps; `sh_degree` is the method's full degree."""
         return Stage(
             explicit=step >= self.first_stage,
-            learn_mask=not self.mask_paused(step) and falls_on(step + taken - 1, taken, self.mask_every),
+            learn_mask=not self.mask_paused(step)
+            and (step < MASK_START * self.steps or falls_on(step + taken - 1, taken, self.mask_every)),
             sh_degree=min(step // self.sh_every, sh_degree),
             learn_encoder=falls_on(step + taken - 1, taken, self.encoder_every),
             # Not on the mask's steps, so that all steps take the same time.

@@ -238,7 +238,7 @@ class Trainer:
         """Pixels that are neither transient nor masked by the user."""
         if output.visibility is None:
             return keep
-        static = output.visibility > self.method.mask_threshold
+        static = output.visibility > self.config.density.min_visibility
         return static if keep is None else static & keep
 
     def _report_marked(self) -> str | None:
@@ -273,6 +273,7 @@ class Trainer:
             observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,
+            num_photos=len(self.views),
         )
         return output, losses
 

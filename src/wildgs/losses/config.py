@@ -14,6 +14,11 @@ class ObjectiveConfig:
         weight_l1: λ^I, weight of L1 in the image loss; D-SSIM has 1 - λ^I.
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
+        mask_weight_photos: Number of training photos from which on λ^M starts at `mask_weight_start`. With fewer
+            photos it starts lower, at `mask_weight_end` with half as many: a few photos are memorised, and
+            passers-by with them, unless masks are quick. 0 disables this. Not in the paper.
+        mask_power: Exponent of M in the image loss (paper: 1). Above 1, pixels that may be transient count little
+            before the mask is sure of it.
         depth_weight: λ^D (paper: 0.05).
         metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
         mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
@@ -26,12 +31,23 @@ class ObjectiveConfig:
     weight_l1: float = 0.8
     mask_weight_start: float = 0.4
     mask_weight_end: float = 0.1
+    mask_weight_photos: int = 90
+    mask_power: float = 3.0
     depth_weight: float = 0.01
     metric_weight: float = 0.1
     mask_gradient: Literal["evidence", "loss"] = "evidence"
     min_alpha: float = 0.5
 
-    def mask_weight(self, progress: float) -> float:
-        """λ^M at a fraction of the training, 0 at its start and 1 at its end (clamped)."""
+    def mask_weight(self, progress: float, num_photos: int | None = None) -> float:
+        """λ^M at one step.
+
+        Args:
+            progress: Fraction of the training, 0 at its start and 1 at its end (clamped).
+            num_photos: Number of training photos; None for enough of them.
+        """
+        start = self.mask_weight_start
+        if num_photos is not None and num_photos < self.mask_weight_photos:
+            beyond_half = max(2 * num_photos / self.mask_weight_photos - 1, 0.0)
+            start = self.mask_weight_end + (start - self.mask_weight_end) * beyond_half
         share = min(max(progress, 0.0), 1.0)
-        return self.mask_weight_start + (self.mask_weight_end - self.mask_weight_start) * share
+        return start + (self.mask_weight_end - start) * share

@@ -61,6 +61,7 @@ def total_loss(
     observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
+    num_photos: int | None = None,
 ) -> Losses:
     """The paper's L_total for one photo.
 
@@ -78,6 +79,7 @@ def total_loss(
         observations: Pixels (x, y) at which the photo observes triangulated points, which are static.
         train_mask: Whether the mask gets a gradient (False in the pause after an opacity reset).
         mask_threshold: Threshold Th of static pixels for the depth loss.
+        num_photos: Number of training photos, on which λ^M depends; None for enough of them.
 
     Returns:
         All terms.
@@ -90,7 +92,7 @@ def total_loss(
     mask = depth_term = zero
     if visibility is not None:
         mask = visibility_regularizer(visibility if keep is None else torch.where(keep, visibility, 1.0))
-        total = total + config.mask_weight(progress) * mask
+        total = total + config.mask_weight(progress, num_photos) * mask
     if depth is not None and (disparity is not None or metric_depth is not None):
         selection = torch.ones_like(depth, dtype=torch.bool) if keep is None else keep
         if visibility is not None:
@@ -112,8 +114,10 @@ def _image_loss(
 ) -> Tensor:
     """L^I, with the configured gradient to the mask."""
     if mask is None or config.mask_gradient == "evidence":
-        return masked_photometric(photo, render, mask, config.weight_l1, proven=proven)
-    mask = mask[..., None]
+        return masked_photometric(
+            photo, render, mask, config.weight_l1, power=config.mask_power, proven=proven
+        )
+    mask = mask[..., None] ** config.mask_power
     return masked_photometric(photo * mask, render * mask, None, config.weight_l1)
 
 

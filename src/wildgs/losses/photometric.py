@@ -16,6 +16,7 @@ def masked_photometric(
     visibility: Float[Tensor, "H W"] | None,
     weight_l1: float = 0.8,
     *,
+    power: float = 1.0,
     proven: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, ""]:
     """``λ |I⊙M - Î⊙M| + (1 - λ) (1 - SSIM(I⊙M, Î⊙M))``, paper section 'Transient Objects Handling'.
@@ -32,6 +33,7 @@ def masked_photometric(
         render: The render Î.
         visibility: M, 1 where the photo shows the static scene; None = 1 everywhere.
         weight_l1: λ.
+        power: Exponent of M in the formula (paper: 1).
         proven: Pixels known to be static (`proven_static`); None for none.
 
     Returns:
@@ -40,7 +42,8 @@ def masked_photometric(
     if visibility is None:
         return _photometric(photo, render, weight_l1)
     fixed = visibility.detach()
-    loss = _photometric(photo * fixed[..., None], render * fixed[..., None], weight_l1)
+    weight = (fixed if power == 1 else fixed**power)[..., None]
+    loss = _photometric(photo * weight, render * weight, weight_l1)
     if visibility.requires_grad:
         # Adds zero to the value and the evidence to the mask's gradient.
         evidence = transient_evidence(photo, render.detach())
