@@ -35,8 +35,8 @@ from torch import Tensor
 
 from resized_demo import write_resized_demo
 from wildgs.engine.config import DensityConfig
-from wildgs.engine.team import Team
 from wildgs.engine.schedule import MASK_START
+from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, method_type
 from wildgs.model.wildgs import WildGSConfig

@@ -26,8 +26,8 @@ class ScheduleConfig:
             spike in the loss for a transient.
         sh_every: Steps between increases of the active SH degree (3DGS: 1,000).
         encoder_every: Train the image encoder every n-th step (not scaled; paper: 1).
-        mask_every: Train the visibility mask every n-th step (not scaled; paper: 1), after the first 30% of the run,
-            where it learns on every step.
+        mask_every: Train the visibility mask every n-th step (not scaled; paper: 1), after the first 30% of the
+            run, where it learns on every step.
         planes_every: Train the triplane's UNet every n-th step (not scaled; paper: 1).
     """
 

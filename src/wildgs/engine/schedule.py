@@ -21,8 +21,8 @@ _FLOOR_SHARE = 5
 """Such a smallest step count is at most this part (one fifth) of a run."""
 
 MASK_START = 0.3
-"""Fraction of a run in which the mask learns on every step, before `mask_every` takes effect. Otherwise the Gaussians
-learn passers-by before the mask does."""
+"""Fraction of a run in which the mask learns on every step, before `mask_every` takes effect. Otherwise the
+Gaussians learn passers-by before the mask does."""
 
 
 class Schedule:
