@@ -11,6 +11,10 @@ import pytest
 import torch
 
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
+from wildgs.engine.config import DensityConfig
+from wildgs.engine.density import SeenView
+from wildgs.engine.density.control import ViewStatistics
+from wildgs.engine.density.relocation import RelocationDensity
 from wildgs.engine.recorder import Recorder
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
@@ -57,6 +61,26 @@ def test_wildgs_separates_lights_that_the_baseline_averages(
             sh = trainer.method.shade(trainer.method.encode(photo, view.camera))
             errors[method] = float((trainer.method.render(view.camera, sh).colors - photo).square().mean())
     assert errors["wildgs"] < 0.5 * errors["3dgs"]
+
+
+def test_growth_ignores_pixels_that_may_be_transient(
+    wall_scene: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares: list[float] = []
+    measure = RelocationDensity.measure
+
+    def recording(
+        self: RelocationDensity, view: SeenView, sound: torch.Tensor | None = None
+    ) -> ViewStatistics:
+        assert view.counts is not None
+        shares.append(float(view.counts.float().mean()))
+        return measure(self, view, sound)
+
+    monkeypatch.setattr(RelocationDensity, "measure", recording)
+    for least in (0.0, 1.0):
+        config = DensityConfig(min_visibility=least)
+        trainer_for(wall_scene, tiny_model, steps=1, density=config).run()
+    assert shares == [1.0, 0.0]
 
 
 def test_first_stage_has_neither_triplane_nor_depth_loss(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
