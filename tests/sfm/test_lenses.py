@@ -24,7 +24,12 @@ def test_lenses_of_phones_and_cameras_are_possible(focal: float, radial: float) 
 
 @pytest.mark.parametrize(
     ("focal", "radial", "why"),
-    [(0.04, 0.0, "171 degrees"), (60.0, 0.0, "degrees"), (0.5, -0.4, "distortion"), (2.9, 19.6, "distortion")],
+    [
+        (0.04, 0.0, "171 degrees"),
+        (60.0, 0.0, "degrees"),
+        (0.5, -0.4, "distortion"),
+        (2.9, 19.6, "distortion"),
+    ],
 )
 def test_panoramas_and_little_planets_are_not(focal: float, radial: float, why: str) -> None:
     assert why in str(lens_fault(camera_of(focal, radial)))
