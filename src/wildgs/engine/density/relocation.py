@@ -97,8 +97,7 @@ class RelocationDensity(DensityControl):
         return DensityReport(0, len(split), pruned)
 
     def _select_useless(self, gaussians: Gaussians, fixed: Tensor, most: int) -> Bool[Tensor, "N"]:
-        """Gaussians that are transparent or non-finite, and the `most` that contribute least (under a
-        threshold)."""
+        """Transparent and non-finite Gaussians, and at most `most` of those with the least contribution."""
         prune = (gaussians.opacities < self.config.prune_opacity) & ~fixed
         prune = prune | self._broken(gaussians)
         hidden = (
