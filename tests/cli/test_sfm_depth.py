@@ -94,7 +94,7 @@ def test_depth_by_stereo_needs_no_network(
     assert "4 written, 0 already existed" in capsys.readouterr().out.replace("\n", " ")
 
 
-@pytest.mark.filterwarnings("ignore:.*other photos agree with:wildgs.errors.WildGSWarning")
+@pytest.mark.filterwarnings("ignore:.*no other photos agree with:wildgs.errors.WildGSWarning")
 def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
     make_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,7 +131,7 @@ def test_training_photos_stand_beside_their_masks(tmp_path: Path) -> None:
     np.testing.assert_allclose(hidden[60, 210], 200, atol=4)
     np.testing.assert_allclose(pictures[f"Training photo {HOSTILE}"][5, 5], (9, 9, 200), atol=8)
     assert len(pictures) == 3
-    assert page.text.index("Photos that fit no light") < page.text.index("Masks of training photos")
+    assert page.text.index("Misfits") < page.text.index("Masks of training photos")
     assert not page.open
 
 

@@ -149,7 +149,9 @@ def test_folders_that_hold_something_else_are_errors(tmp_path: Path, tiny_networ
 def test_where_it_cannot_be_had_one_warning_says_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(depth_prior, "hub_reachable", lambda: False)
     started = time.monotonic()
-    with pytest.warns(WildGSWarning, match="no depth prior but what depth/ holds.*hf download") as caught:
+    with pytest.warns(
+        WildGSWarning, match="only depth maps already in depth/ are used.*hf download"
+    ) as caught:
         assert load_depth_anything("wildgs-tests/not-there") is None
     assert len(caught) == 1
     assert time.monotonic() - started < 60

@@ -161,9 +161,9 @@ def test_no_gaussian_needs_no_kernel(monkeypatch: pytest.MonkeyPatch):
     ("nvcc", "wanted", "words"),
     [
         (None, "13.0", "nvcc is not installed; torch was built with CUDA 13.0"),
-        ("12.4", "13.0", "is of CUDA 12.4, and torch was built with CUDA 13.0"),
+        ("12.4", "13.0", "belongs to CUDA 12.4, but torch was built with CUDA 13.0"),
         ("13.1", "13.0", None),
-        ("13.0", None, "this build of torch has no CUDA"),
+        ("13.0", None, "this build of torch does not support CUDA"),
     ],
 )
 def test_the_compiler_is_compared_with_torch(

@@ -45,7 +45,7 @@ def test_colours_of_other_gaussians():
 
 def test_float64_needs_the_reference():
     doubles = [t.double() for t in inputs()]
-    with pytest.raises(ValueError, match="'reference' takes float64"):
+    with pytest.raises(ValueError, match="'reference' accepts float64"):
         project(*doubles, CAMERA)
     assert project(*doubles, CAMERA, backend="reference").means2d.dtype == torch.float64
 

@@ -25,8 +25,8 @@ class Score:
     Attributes:
         scene: The scene's name.
         method: The method's name in the bench.
-        seed: Of the run.
-        metrics: What its `metrics.json` holds.
+        seed: The run's seed.
+        metrics: Content of its `metrics.json`.
     """
 
     scene: str
@@ -45,7 +45,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float | None]) -> Spread | None:
-        """Over the values that are there; None where none is."""
+        """Statistics of the values that are not None; None if there are none."""
         known = [value for value in values if value is not None]
         if not known:
             return None
@@ -55,20 +55,20 @@ class Spread:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table.
+    """One row of the table.
 
     Attributes:
         scene: The scene's name.
         protocol: `full` or `half`.
         method: The method's name.
-        label: How the table shows it.
-        seeds: Of its runs; empty for a method that has published figures only.
+        label: The method's label in the table.
+        seeds: Seeds of its runs; empty for a method that has published figures only.
         steps: Training steps.
-        quantities: By the names in `QUANTITIES`; None where nothing could be computed.
+        quantities: Statistics by the names in `QUANTITIES`; None if a quantity could not be computed.
         gain: PSNR minus the baseline's of the same seed; None for the baseline itself or without it.
-        lpips_network: `alex`, `squeeze`, None without LPIPS, or `mixed`: then LPIPS is None, since figures of
-            different networks do not compare.
-        device: On which it was timed.
+        lpips_network: `alex`, `squeeze`, None without LPIPS, or `mixed`; then LPIPS is None, since figures of
+            different networks are not comparable.
+        device: The device on which it was timed.
         published: The paper's figures, by the same names.
     """
 
@@ -95,14 +95,14 @@ def summarize(
     published: Published | None = None,
     baseline: str = DEFAULT_METHOD,
 ) -> list[Row]:
-    """Rows by scene (as they come), protocol, and method in the order of `labels`.
+    """Builds rows by scene (in the order of the scores), protocol, and method (in the order of `labels`).
 
     Args:
-        scores: Of any number of runs; the two protocols go to different rows.
-        labels: From method to what the table shows.
-        published: From scene and method to published figures, which stand in rows of protocol `full`. Methods
-            in `labels` without runs get a row where they have such figures.
-        baseline: The method against which gains are counted.
+        scores: Scores of any number of runs; the two protocols go to different rows.
+        labels: Method name to label in the table.
+        published: Function from scene and method to published figures, shown in rows of protocol `full`. Methods
+            in `labels` without runs get a row if they have such figures.
+        baseline: The method relative to which gains are computed.
     """
     rows = []
     for scene in dict.fromkeys(score.scene for score in scores):

@@ -21,8 +21,8 @@ class Section:
 
     Attributes:
         title: Scene and protocol.
-        header: Of the columns that hold anything.
-        lines: A cell per column.
+        header: Headings of the columns that are not empty.
+        lines: One cell per column.
     """
 
     title: str
@@ -37,7 +37,7 @@ class _Column:
 
 
 def sections(rows: Sequence[Row]) -> list[Section]:
-    """One table per scene and protocol: figures of the two protocols never stand in one column."""
+    """One table per scene and protocol, since figures of the two protocols are not comparable."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.scene, row.protocol), []).append(row)
@@ -101,7 +101,7 @@ _COLUMNS = (
 
 
 def legend(rows: Sequence[Row]) -> list[str]:
-    """What a reader must know to read the figures."""
+    """Explanations of the columns."""
     lines = []
     if any(len(row.seeds) > 1 for row in rows):
         lines.append("Mean ± sample standard deviation over seeds.")
@@ -139,24 +139,24 @@ def legend(rows: Sequence[Row]) -> list[str]:
 def _lpips_line(rows: Sequence[Row]) -> str:
     networks = {row.lpips_network for row in rows if row.seeds}
     if networks == {None}:
-        return "LPIPS: none, its weights were not at hand."
+        return "LPIPS: none, since its weights were not available."
     if len(networks) == 1 and MIXED not in networks:
         return (
             f"LPIPS v0.1 with {' '.join(NETWORKS.get(str(network), str(network)) for network in networks)}."
         )
     return (
-        "LPIPS: runs were scored with different networks, or without one; figures of different networks do not "
-        "compare. The same command scores again what still has its checkpoint."
+        "LPIPS: runs were scored with different networks, or without one; figures of different networks are not "
+        "comparable. The same command scores runs again if their checkpoints still exist."
     )
 
 
 def to_markdown(rows: Sequence[Row], heading: str, notes: Sequence[str] = ()) -> str:
-    """The tables with their legend.
+    """Formats the tables with their legend as markdown.
 
     Args:
-        rows: From `summarize`.
+        rows: Rows of `summarize`.
         heading: First line below the title.
-        notes: Further lines for the legend.
+        notes: Additional lines of the legend.
     """
     parts = ["# Benchmark", heading]
     for section in sections(rows):
@@ -173,7 +173,7 @@ def _escape(cell: str) -> str:
 
 
 def to_records(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Rows as flat records: the columns of the csv, and `rows` of the JSON. Times in seconds."""
+    """Rows as flat records (times in seconds): the columns of the csv, and `rows` of the JSON."""
     return [_record(row) for row in rows]
 
 
@@ -195,7 +195,7 @@ def _record(row: Row) -> dict[str, Any]:
 
 
 def to_csv(rows: Sequence[Row]) -> str:
-    """One line per row, plain numbers, empty where there is none."""
+    """Formats one line per row with plain numbers; missing values are empty."""
     records = to_records(rows)
     if not records:
         return ""

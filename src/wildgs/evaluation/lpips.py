@@ -15,11 +15,11 @@ from wildgs.model.squeezenet import LPIPS_TAPS, LPIPS_WIDTHS, packaged_weights, 
 
 Network = Literal["alex", "squeeze"]
 MIN_SIDE = 32
-"""Smallest side in pixels for which the deepest layer of both backbones is not empty."""
+"""Minimum side in pixels for which the deepest layer of both backbones is not empty."""
 ENVIRONMENT = "WILDGS_LPIPS"
-"""A folder with a backbone and its linear layers, or ``off`` for no LPIPS at all."""
+"""Environment variable: a folder with a backbone and its linear layers, or ``off`` to disable LPIPS."""
 
-# Normalisation of inputs in [-1, 1], from LPIPS.
+# LPIPS's normalisation of inputs in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _BACKBONE_NAMES: dict[Network, str] = {"alex": "alexnet*.pth", "squeeze": "squeezenet1_1*.pth"}
@@ -27,10 +27,10 @@ _TITLES: dict[Network, str] = {"alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
 
 
 class LPIPS(nn.Module):
-    """Learned perceptual distance of two pictures.
+    """Learned perceptual distance of two images.
 
     Features after each tapped ReLU are normalised to unit length over the channels; squared differences are
-    weighted by the linear layer and averaged over the picture.
+    weighted by the linear layer and averaged over the image.
     """
 
     shift: Tensor
@@ -52,7 +52,7 @@ class LPIPS(nn.Module):
         """Loads weights in the layouts of torchvision and LPIPS.
 
         Args:
-            backbone: State dict of torchvision, of the whole network or of its `features`.
+            backbone: torchvision's state dict of the whole network or of its `features`.
             linear: ``lin{i}.model.1.weight`` of LPIPS, each [1, C, 1, 1].
 
         Raises:
@@ -65,12 +65,12 @@ class LPIPS(nn.Module):
         for i, weight in enumerate(self.linear):
             given = linear.get(f"lin{i}.model.1.weight")
             if given is None or given.numel() != weight.numel():
-                raise RuntimeError(f"linear layer {i} is missing or not of {weight.numel()} channels")
+                raise RuntimeError(f"linear layer {i} is missing or does not have {weight.numel()} channels")
             weight.copy_(given.flatten())
 
     @torch.no_grad()
     def forward(self, first: UInt8[Tensor, "H W 3"], second: UInt8[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """The distance: 0 for equal pictures, about 0.7 for unlike ones.
+        """Computes the distance: 0 for identical images, about 0.7 for unrelated ones.
 
         Raises:
             ValueError: A side is shorter than `MIN_SIDE` pixels.
@@ -90,11 +90,11 @@ class LPIPS(nn.Module):
 
 
 def load_lpips(folder: Path | None = None) -> tuple[LPIPS | None, str]:
-    """The network, and a line for the notes that says which one it is, or why there is none.
+    """Loads the network; returns it with a note that names it, or None with a note that gives the reason.
 
     Args:
-        folder: Holds a backbone with its linear layers, AlexNet's or SqueezeNet's. None takes the folder that
-            `WILDGS_LPIPS` names, and without that setting the SqueezeNet of the package.
+        folder: Folder of a backbone (AlexNet or SqueezeNet) and its linear layers. None uses the folder in
+            `WILDGS_LPIPS`, and the packaged SqueezeNet if that is not set.
     """
     setting = os.environ.get(ENVIRONMENT, "").strip()
     if folder is None and setting.lower() == "off":
@@ -121,14 +121,14 @@ def _load_from(folder: Path) -> tuple[LPIPS | None, str]:
         model.load(_read(backbone), _read(linear))
     except (
         Exception
-    ) as error:  # unpickling raises errors of many kinds; scores without LPIPS beat none at all
+    ) as error:  # unpickling raises many kinds of errors; scores without LPIPS are better than none
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         return None, f"LPIPS is null: cannot load {backbone} or {linear} ({reason})"
     return model, _title(model)
 
 
 def _find_in(folder: Path) -> tuple[Network, Path, Path] | None:
-    """A backbone and its linear layers; AlexNet's before SqueezeNet's."""
+    """Finds a backbone and its linear layers; AlexNet takes precedence over SqueezeNet."""
     for network, pattern in _BACKBONE_NAMES.items():
         backbone = next(iter(sorted(folder.glob(pattern))), None)
         names = (f"lpips_{network}.pth", f"{network}.pth", "linear.pth")
@@ -147,7 +147,7 @@ def _title(model: LPIPS) -> str:
 
 
 def _alexnet_layers() -> nn.Sequential:
-    """Layers at torchvision's positions."""
+    """Layers at the indices of torchvision's AlexNet."""
     return nn.Sequential(
         nn.Conv2d(3, 64, 11, stride=4, padding=2),
         nn.ReLU(),

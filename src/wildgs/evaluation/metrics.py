@@ -1,4 +1,4 @@
-"""Scores of renders (PSNR, SSIM, detail) on pictures rounded to 8 bits, and of transient masks (AP, IoU)."""
+"""Metrics of renders (PSNR, SSIM, detail) on images rounded to 8 bits, and of transient masks (AP, IoU)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from wildgs.losses.ssim import ssim_map
 
 _BINS = 1 << 16
 MAX_PSNR = 100.0
-"""PSNR of equal pictures in dB, so that means stay finite."""
+"""PSNR of identical images in dB, so that means stay finite."""
 LANDMARK_REACH = 0.03
-"""Pixels within this share of the longer side of a triangulated observation belong to the landmark."""
+"""Pixels this close to a triangulated observation, relative to the longer side, belong to the landmark."""
 LEAST_OBSERVATIONS = 20
-"""Photos with fewer observations do not tell where the landmark is."""
+"""Minimum number of observations to determine which pixels show the landmark."""
 LEAST_LANDMARK_PIXELS = 50
 DETAIL_SIGMA = 1.5
-"""Standard deviation of the Gaussian, in pixels, that takes low frequencies out."""
+"""Standard deviation in pixels of the Gaussian that separates low from high frequencies."""
 
 
 def to_8bit(picture: Float[Tensor, "H W 3"]) -> UInt8[Tensor, "H W 3"]:
@@ -69,12 +69,12 @@ def structural_similarity(
 
 
 def landmark_pixels(observed: Float[Tensor, "K 2"], height: int, width: int) -> Bool[Tensor, "H W"] | None:
-    """Which pixels show the landmark: those close to a triangulated observation.
+    """Mask of the pixels that show the landmark: those close to a triangulated observation.
 
     Args:
         observed: Observations of the photo (x, y), pixels.
-        height: Of the photo.
-        width: Of the photo.
+        height: Height of the photo.
+        width: Width of the photo.
 
     Returns:
         None for a photo with fewer than `LEAST_OBSERVATIONS` observations.
@@ -89,11 +89,11 @@ def landmark_pixels(observed: Float[Tensor, "K 2"], height: int, width: int) -> 
 
 
 class Detail(NamedTuple):
-    """High frequencies of a render's luminance against the truth's.
+    """Comparison of the high frequencies of a render's luminance with those of the ground truth.
 
     Attributes:
-        energy: Their standard deviation over the truth's: below 1 the render is blurred, above 1 it is noisy.
-        correlation: Of the two; 1 where the detail is the truth's own.
+        energy: Ratio of their standard deviations: below 1 the render is blurred, above 1 it is noisy.
+        correlation: Their correlation; 1 if the render has exactly the detail of the ground truth.
     """
 
     energy: float | None
@@ -103,15 +103,15 @@ class Detail(NamedTuple):
 def detail(
     render: UInt8[Tensor, "H W 3"], truth: UInt8[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None = None
 ) -> Detail:
-    """Compares high frequencies, after the affine colour map that fits the render best to the truth.
+    """Compares high frequencies, after the affine colour map that fits the render best to the ground truth.
 
     Args:
-        render: Picture to score.
+        render: Image to score.
         truth: Ground truth.
-        keep: Pixels that count; None for all.
+        keep: Mask of the pixels to score; None for all.
 
     Returns:
-        Nones where one of the pictures has no high frequencies.
+        The comparison; None values if one of the images has no high frequencies.
     """
     chosen = np.ones(render.shape[:2], dtype=bool) if keep is None else keep.cpu().numpy()
     drawn, true = (picture.cpu().numpy().astype(np.float64) / 255 for picture in (render, truth))
@@ -130,10 +130,10 @@ def _high_frequencies(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, 
 
 
 class MaskScore:
-    """Scores predicted transient masks against the ground truth, pooled over the pixels of many photos.
+    """Scores of predicted transient masks against the ground truth, pooled over the pixels of all photos.
 
-    Transient pixels are positives with score ``1 - M``. Scores are counted in 65,536 bins, so that memory does not
-    grow with the number of photos.
+    Transient pixels are positives with score ``1 - M``. Scores are counted in a histogram of 65,536 bins, so that
+    memory does not grow with the number of photos.
     """
 
     def __init__(self, threshold: float = 0.5) -> None:
@@ -163,7 +163,7 @@ class MaskScore:
 
     @property
     def average_precision(self) -> float | None:
-        """Σ (R_n - R_{n-1}) P_n over all thresholds (as in scikit-learn); None without transients."""
+        """Average precision Σ (R_n - R_{n-1}) P_n over thresholds, as in scikit-learn; None without transients."""
         negatives, positives = self._counts.flip(1).cumsum(1)
         total = positives[-1]
         if total == 0:

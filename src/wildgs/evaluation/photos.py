@@ -1,4 +1,8 @@
-"""How well training photos fit a trained run: what their masks hide, and which photos fit no light."""
+"""How well training photos fit a trained run: what their masks hide, and which photos are misfits.
+
+A misfit is a photo that the model reproduces badly under every appearance: a collage, a drawing, another place, or
+a wrong pose.
+"""
 
 from __future__ import annotations
 
@@ -25,44 +29,44 @@ from wildgs.rasterize import blend
 from wildgs.scene.scene import Scene, View, observed_pixels
 
 PHOTOS_FILE = "photos.json"
-"""In the run folder: what `inspect_photos` found."""
+"""File in the run folder with the results of `inspect_photos`."""
 HIDDEN = 0.5
-"""Pixels with a visibility M below it are hidden."""
+"""Pixels with a visibility M below this are hidden."""
 COMPARED_SIDE = 160
-"""Renders are compared with photos at this long side, at most, in pixels."""
+"""Maximum long side in pixels at which renders are compared with photos."""
 LEAST_SHOWN = 0.01
-"""Photos of which the mask leaves less than this share are not compared."""
+"""Photos of which the mask leaves a smaller share visible are not compared."""
 DEVIATIONS = 3.5
-"""A photo fits no light if it is so many robust standard deviations worse than the collection's median."""
+"""A photo is a misfit if it is this many robust standard deviations worse than the collection's median."""
 LEAST_DEVIATION = {"psnr": 1.0, "hidden": 0.05}
-"""Smaller deviations count as this: dB, and share of the photo. In an even collection little would stand out."""
+"""Lower bounds of the standard deviations (dB, and share of the photo), for very uniform collections."""
 MOSTLY = 0.5
-"""A mask that hides less of a photo than this share is no reason to name the photo."""
+"""A mask that hides a smaller share of a photo does not make it a misfit."""
 STRUCTURE_LOSS = 0.5
-"""A photo whose structure is lower than the median's by more than this share of it fits no light."""
+"""A photo is a misfit if its structure is below the median by more than this share of the median."""
 LEAST_STRUCTURE = 0.2
-"""A lower median: nothing is learnt yet that a photo could fit."""
+"""Structure is not judged if its median is lower: the model has not learnt enough yet."""
 WINDOW = 0.025
-"""Standard deviation of the window of structure, as a share of the longer side."""
+"""Standard deviation of the Gaussian window of structure, relative to the longer side."""
 LEAST_VARIANCE = 1e-4
-"""Windows of less luminance variance are flat, and their correlation is noise."""
+"""Regulariser of the correlation: windows of lower luminance variance are flat, and their correlation is noise."""
 LEAST_PHOTOS = 8
-"""Fewer photos have no usual fit from which one could differ."""
+"""Minimum number of photos for robust statistics."""
 
 
 @dataclass(frozen=True)
 class PhotoFit:
-    """How well one training photo fits the run; None for what could not be computed.
+    """How well one training photo fits the run; None for values that could not be computed.
 
     Attributes:
-        name: Of the photo.
-        psnr: Of the render under the photo's own appearance, over pixels that the mask does not hide, dB.
+        name: Name of the photo.
+        psnr: PSNR of the render under the photo's own appearance over pixels that the mask does not hide, dB.
         structure: Local correlation of the luminances of render and photo over the same pixels, weighted by the
-            photo's local contrast: 1 where edges agree, whatever the light; 0 where they have nothing in common.
+            photo's local contrast: 1 if all edges agree, independent of lighting; 0 if none do.
         hidden: Share of pixels with M < `HIDDEN`.
-        static_hidden: Share of static observations with M < `HIDDEN`: projections of points that three photos or
-            more triangulated, which are no passers-by.
-        observations: Number of these observations.
+        static_hidden: Share of static observations with M < `HIDDEN`. Static observations are projections of points
+            that at least three photos triangulated, so they cannot show passers-by.
+        observations: Number of static observations.
     """
 
     name: str
@@ -75,8 +79,8 @@ class PhotoFit:
 
 @contextmanager
 def inference(method: Method) -> Iterator[None]:
-    """Evaluation mode without gradients for the time of a block."""
-    # Not inference_mode: tensors that a method caches must stay usable in training.
+    """Context manager: evaluation mode without gradients."""
+    # Not torch.inference_mode, since tensors that a method caches must remain usable in training.
     training = method.training
     method.eval()
     try:
@@ -89,15 +93,15 @@ def inference(method: Method) -> Iterator[None]:
 def inspect_photos(
     method: Method, scene: Scene, on_photo: Callable[[int, int], None] | None = None
 ) -> list[PhotoFit]:
-    """Renders every training photo under its own appearance, small, and looks at its mask.
+    """Renders every training photo under its own appearance at low resolution, and measures its mask.
 
     Args:
         method: A trained method.
         scene: The scene on which it was trained.
-        on_photo: Called with (photos inspected, photos in all).
+        on_photo: Called with (photos inspected, total).
 
     Returns:
-        One entry per training photo that can be read; none for a method that has one light only.
+        One entry per readable training photo; none for a method without appearance.
     """
     if not method.relightable:
         return []
@@ -106,7 +110,7 @@ def inspect_photos(
         for count, view in enumerate(views, start=1):
             try:
                 found.append(_inspect(method, view, observed.get(view.name)))
-            except UserError:  # the photo is gone since training; the others are as good
+            except UserError:  # the photo was removed after training; the others are still inspected
                 continue
             if on_photo is not None:
                 on_photo(count, len(views))
@@ -144,7 +148,7 @@ def _inspect(method: Method, view: View, observed: Float[Tensor, "K 2"] | None) 
 def _structure(
     photo: Float[Tensor, "h w"], render: Float[Tensor, "h w"], weights: Float[Tensor, "h w"]
 ) -> float:
-    """Correlation of two luminances in Gaussian windows, averaged by the photo's contrast."""
+    """Correlation of two luminances in Gaussian windows, averaged with the photo's contrast as weight."""
     first, second, shown = (values.double().cpu().numpy() for values in (photo, render, weights))
     sigma = WINDOW * max(first.shape)
     blurs = [gaussian_filter(x, sigma) for x in (first, second, first**2, second**2, first * second)]
@@ -156,15 +160,15 @@ def _structure(
 
 
 def find_misfits(photos: Sequence[PhotoFit]) -> list[PhotoFit]:
-    """Photos that fit no light, worst first: collages, drawings, other places, wrong poses.
+    """Selects misfits, worst first: collages, drawings, photos of other places, wrong poses.
 
-    A photo is named for one of three reasons. Its structure is less than half of the median's: whatever the light,
-    edges lie elsewhere. Its PSNR lies `DEVIATIONS` robust standard deviations below the median. Or its mask hides
-    most of it, and as many deviations more than usual.
+    A photo is a misfit if at least one of three criteria holds. Its structure is less than half of the median:
+    edges are in other places, which lighting cannot explain. Its PSNR is `DEVIATIONS` robust standard deviations
+    below the median. Or its mask hides most of the photo, and `DEVIATIONS` robust deviations more than the median.
 
-    Mean and standard deviation would follow the very photos that are looked for. The deviation is that of a normal
-    distribution with the same median absolute deviation, or with the same quartile on the bad side where that is
-    more: a quarter of all photos, say those at night, is no misfit.
+    The deviations are robust, since outliers would dominate mean and standard deviation: the standard deviation is
+    that of a normal distribution with the same median absolute deviation, or with the same quartile on the bad
+    side if that is larger. A quarter of the photos, for example those at night, are therefore not misfits.
     """
     severities = dict.fromkeys((photo.name for photo in photos), 0.0)
 
@@ -189,7 +193,7 @@ def find_misfits(photos: Sequence[PhotoFit]) -> list[PhotoFit]:
 
 
 def _deviations(values: Sequence[float], least: float) -> list[float]:
-    """How far each value lies above the median; 1 is `DEVIATIONS` robust standard deviations."""
+    """Distance of each value above the median, in units of `DEVIATIONS` robust standard deviations."""
     if not values:
         return []
     middle, quartile = (float(q) for q in np.quantile(values, (0.5, 0.75)))
@@ -199,20 +203,19 @@ def _deviations(values: Sequence[float], least: float) -> list[float]:
 
 
 def describe_misfits(photos: Sequence[PhotoFit], most: int = 8) -> list[str]:
-    """Lines for people: which photos fit no light, worst first, and how much of each was hidden."""
+    """Log lines that list the misfits, worst first, with the share of each that its mask hides."""
     named = find_misfits(photos)
     if not named:
         return []
     rated = [photo for photo in photos if photo.psnr is not None]
     usual = statistics.median(photo.psnr or 0.0 for photo in rated)
     structure = statistics.median(photo.structure for photo in rated)
-    fit = "fit" if len(named) > 1 else "fits"
     lines = [
-        f"{len(named)} of {len(photos)} training photos {fit} no light (usual: {usual:.1f} dB, structure "
+        f"{len(named)} of {len(photos)} training photos do not fit the scene (median: {usual:.1f} dB, structure "
         f"{structure:.2f}), worst first; remove them if they show something else:"
     ]
     for photo in named[:most]:
-        fit = "nothing to compare"
+        fit = "no visible pixels to compare"
         if photo.psnr is not None:
             fit = f"{photo.psnr:.1f} dB, structure {photo.structure:.2f}"
         mask = "" if photo.hidden is None else f", {photo.hidden:.0%} hidden by its mask"
@@ -221,11 +224,11 @@ def describe_misfits(photos: Sequence[PhotoFit], most: int = 8) -> list[str]:
 
 
 def summarize_photos(photos: Sequence[PhotoFit]) -> dict[str, Any]:
-    """What `metrics.json` says of training photos; nulls without tracks or masks.
+    """Entries of `metrics.json` about training photos; null without tracks or masks.
 
     Returns:
         `static_hidden`, the share of static observations hidden over all photos; `static_hidden_worst`, that of
-        the worst photo; and `misfits`, the photos that fit no light.
+        the worst photo; and `misfits`, the entries of the misfits.
     """
     proven = [photo for photo in photos if photo.static_hidden is not None]
     total = sum(photo.observations for photo in proven)
@@ -245,7 +248,7 @@ def write_photos(folder: Path, step: int, photos: Sequence[PhotoFit]) -> None:
 
 
 def read_photos(folder: Path, step: int) -> list[PhotoFit] | None:
-    """What `write_photos` wrote after so many steps; None where there is no such file."""
+    """Reads the results that `write_photos` stored for a training step; None if there are none."""
     try:
         content = read_json(folder / PHOTOS_FILE)
         return [PhotoFit(**photo) for photo in content["photos"]] if content["step"] == step else None
@@ -254,5 +257,5 @@ def read_photos(folder: Path, step: int) -> list[PhotoFit] | None:
         ValueError,
         TypeError,
         KeyError,
-    ):  # absent, of another version, or cut off: computed again
+    ):  # missing, truncated or of another version: computed again
         return None

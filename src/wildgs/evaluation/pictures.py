@@ -1,4 +1,4 @@
-"""Output files: one picture per view, and JSON, written atomically."""
+"""Output files of evaluation: one image per view, and JSON, written atomically."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from wildgs.files import written_aside
 
 
 def picture_paths(names: Iterable[str]) -> dict[str, PurePosixPath]:
-    """Relative path of the picture of each view.
+    """Relative path of the image of each view.
 
-    Folders in a name are kept, parts that leave the output folder (``..``, a root, a drive) are replaced, and the
-    suffix is kept for views that differ in nothing else, so that no two views share a file.
+    Folders in a name are kept, and parts that leave the output folder (``..``, a root, a drive) are replaced. Views
+    whose names differ only in the suffix keep it, so that no two views share a file.
 
     Args:
         names: Unique view names.
@@ -46,7 +46,7 @@ def _inside(name: str) -> PurePosixPath:
 
 
 def write_picture(file: Path, picture: UInt8[Tensor, "H W 3"]) -> None:
-    """Writes a PNG, or a JPEG where the name asks for one; an interrupted run leaves no partial picture."""
+    """Writes a PNG or JPEG, by the suffix, atomically."""
     jpeg = file.suffix.lower() in (".jpg", ".jpeg")
     options = {"format": "JPEG", "quality": 95} if jpeg else {"format": "PNG"}
     with written_aside(file) as aside:

@@ -1,4 +1,4 @@
-"""The two evaluation protocols: appearance from the whole test photo, or from its left half."""
+"""The two evaluation protocols: appearance from the whole test photo (`full`), or from its left half (`half`)."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class ImageScore:
     """Scores of one view; None if a metric could not be computed.
 
     Attributes:
-        name: Of the photo.
+        name: Name of the photo.
         psnr: PSNR, dB.
         ssim: SSIM.
         lpips: LPIPS.
         landmark: PSNR of the pixels near triangulated observations, dB, see `landmark_pixels`.
-        elsewhere: PSNR of the others (sky, ground, passers-by), dB.
+        elsewhere: PSNR of the other pixels (sky, ground, passers-by), dB.
         detail_energy: See `wildgs.evaluation.metrics.Detail`.
-        detail_correlation: Likewise.
+        detail_correlation: See `wildgs.evaluation.metrics.Detail`.
     """
 
     name: str
@@ -87,14 +87,14 @@ def evaluate(
     """Renders and scores the held-out views; writes ``eval/<protocol>/<stem>.png`` and ``metrics.json``.
 
     `full` takes the appearance of a view from the whole test photo and scores the whole image. `half` takes it
-    from the left half (columns below ``W // 2``, with a cropped camera: mask, embedding and lifting see nothing
-    else) and scores the right half as an image of its own. The written picture is the whole image in both.
+    from the left half (columns below ``W // 2``, with a cropped camera, so that mask, embedding and lifting use
+    nothing else) and scores the right half as a separate image. The whole image is written in both cases.
 
-    A view is scored against its clean truth if there is one, otherwise against the photo. In the latter case,
-    pixels that the mask of the view ignores are excluded from PSNR and SSIM, and replaced by the photo for LPIPS.
+    A view is scored against its clean ground truth if there is one, otherwise against the photo. In the latter
+    case, pixels that the user's mask ignores are excluded from PSNR and SSIM, and replaced by the photo for LPIPS.
     Renders are rounded to 8 bits first.
 
-    In `full`, predicted masks of training photos are scored too: against ground truth masks if the scene has some,
+    In `full`, predicted masks of training photos are scored too: against ground truth masks if the scene has any,
     and by the share of static observations that they hide (`photos`).
 
     Args:
@@ -102,11 +102,11 @@ def evaluate(
         scene: Scene with at least one test view.
         protocol: `full` or `half`.
         run: Run folder.
-        step: Training steps of `method`, for the record.
-        train_seconds: Training time, for the record.
-        lpips_folder: Folder of LPIPS weights; by default as in `load_lpips`.
-        mask_threshold: Threshold Th for the intersection over union of masks.
-        photos: What `inspect_photos` found of training photos.
+        step: Number of training steps of `method`; only recorded.
+        train_seconds: Training time; only recorded.
+        lpips_folder: Folder of LPIPS weights; the default is described in `load_lpips`.
+        mask_threshold: Threshold Th of the intersection over union of masks.
+        photos: Results of `inspect_photos`.
         on_view: Called with the name of each finished view.
 
     Returns:
@@ -116,7 +116,7 @@ def evaluate(
         UserError: The scene has no test views.
     """
     if not scene.test_views:
-        raise UserError(f"{scene.root} has no test photos to score: mark some as 'test' in its split .tsv")
+        raise UserError(f"{scene.root} has no test photos to evaluate: mark some as 'test' in its split .tsv")
     folder = run / "eval" / protocol
     lpips, line = load_lpips(lpips_folder)
     notes = _Notes([line])
@@ -156,7 +156,7 @@ def evaluate(
 
 
 def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
-    """Spherical harmonics under the appearance of the view, from the part of the photo that the protocol shows."""
+    """Spherical harmonics under the appearance of the part of the photo that the protocol allows."""
     (photo, keep), camera = view.load(device), view.camera.to(device)
     if protocol == "half":
         half = photo.shape[1] // 2
@@ -184,7 +184,7 @@ def _score_view(
     truth = (view.read_photo() if clean is None else clean).to(render.device)
     keep = _read_keep(view, render.device) if clean is None else None
     if clean is not None:
-        notes.add("views with a clean truth are scored against it instead of the photo")
+        notes.add("views with a clean ground truth are scored against it instead of the photo")
     near = landmark_pixels(observed[view.name], *render.shape[:2]) if view.name in observed else None
     near = None if near is None else near.to(render.device)
     if protocol == "half":
@@ -200,7 +200,7 @@ def _score_view(
             notes.add(f"{view.name}: the mask ignores all pixels that would be scored")
             return ImageScore(view.name)
     energy, correlation = detail(render, truth, keep)
-    landmark, elsewhere = (None, None) if near is None else _apart(render, truth, near, keep)
+    landmark, elsewhere = (None, None) if near is None else _landmark_psnr(render, truth, near, keep)
     return ImageScore(
         name=view.name,
         psnr=psnr(render, truth, keep),
@@ -213,13 +213,13 @@ def _score_view(
     )
 
 
-def _apart(
+def _landmark_psnr(
     render: UInt8[Tensor, "H W 3"],
     truth: UInt8[Tensor, "H W 3"],
     near: Bool[Tensor, "H W"],
     keep: Bool[Tensor, "H W"] | None,
 ) -> tuple[float | None, float | None]:
-    """PSNR of the landmark, and of what is elsewhere; None where it has too few pixels."""
+    """PSNR of the landmark and of the remaining pixels; None if the landmark has too few pixels."""
     parts = [part if keep is None else part & keep for part in (near, ~near)]
     if int(parts[0].sum()) < LEAST_LANDMARK_PIXELS:
         return None, None
@@ -243,7 +243,9 @@ def _perceptual(
     if lpips is None:
         return None
     if min(render.shape[:2]) < MIN_SIDE:
-        notes.add(f"{view.name}: LPIPS is null, the scored part has fewer than {MIN_SIDE} pixels per side")
+        notes.add(
+            f"{view.name}: LPIPS is null, since the scored part has fewer than {MIN_SIDE} pixels per side"
+        )
         return None
     if keep is not None:
         render = torch.where(keep[..., None], render, truth)
@@ -253,7 +255,7 @@ def _perceptual(
 def _measure_fps(
     method: Method, sh: Float[Tensor, "N K 3"], views: tuple[View, ...], device: torch.device
 ) -> float:
-    """Frames per second under cached harmonics: the median over the cameras of the views."""
+    """Rendering speed in frames per second with cached harmonics: the median over the cameras of the views."""
     cameras = [view.camera.to(device) for view in views[:_TIMED_FRAMES]]
     method.render(cameras[0], sh)
     seconds = []

@@ -1,4 +1,4 @@
-"""Table 1 of the paper, to print beside measured scores: Phototourism at half resolution, one RTX 3090."""
+"""Published scores (table 1 of the paper), for comparison: Phototourism at half resolution, one RTX 3090."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ PHOTOTOURISM = ("brandenburg_gate", "sacre_coeur", "trevi_fountain")
 """Folder names of the scenes, as distributed."""
 
 LABELS = {"nerf-w": "NeRF-W", "ha-nerf": "Ha-NeRF", "cr-nerf": "CR-NeRF"}
-"""Methods of the table that are not part of this package."""
+"""Labels of the table's methods that are not part of this package."""
 
 _METRICS = ("psnr", "ssim", "lpips")
 _TABLE: dict[str, tuple[float, ...]] = {
@@ -26,14 +26,14 @@ _TABLE: dict[str, tuple[float, ...]] = {
 
 
 def published_figures(scene: str, method: str) -> dict[str, float] | None:
-    """Published figures for a scene and method, by the names of `metrics.json`; protocol `full`.
+    """Published figures of a scene and method, by the names of `metrics.json`; protocol `full`.
 
     Args:
         scene: One of `PHOTOTOURISM`.
         method: A method of `wildgs bench`, or of `LABELS`.
 
     Returns:
-        ``psnr``, ``ssim``, ``lpips``, ``train_seconds`` and ``render_fps`` (the last two are one figure for all
+        ``psnr``, ``ssim``, ``lpips``, ``train_seconds`` and ``render_fps`` (the last two are the same for all
         three scenes); None if the table has no such row.
     """
     if scene not in PHOTOTOURISM or method not in _TABLE:

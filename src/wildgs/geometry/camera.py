@@ -1,4 +1,4 @@
-"""Pinhole cameras, in the one convention of the package."""
+"""Pinhole cameras in the OpenCV convention."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ class Camera:
         """World coordinates of pixel centres at depths along z (not along the ray), world units.
 
         Args:
-            depth: Of the pixels.
-            pixels: Their rows and columns; None for the whole picture.
+            depth: Depths of the pixels.
+            pixels: Rows and columns of the pixels; None for the whole image.
         """
         rays = self.pixel_rays(pixels)
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
@@ -83,7 +83,7 @@ class Camera:
     def pixel_rays(
         self, pixels: tuple[Int[Tensor, "*pixels"], Int[Tensor, "*pixels"]] | None = None
     ) -> Float[Tensor, "*pixels 3"]:
-        """Camera-space rays through the pixel centres, scaled to z = 1; `pixels` as for `unproject`."""
+        """Camera-space rays through the pixel centres, scaled to z = 1; `pixels` as in `unproject`."""
         if pixels is None:
             sides = (torch.arange(side, device=self.K.device) for side in (self.height, self.width))
             y, x = torch.meshgrid(*sides, indexing="ij")

@@ -1,4 +1,4 @@
-"""Camera files: the JSON format of docs/cameras.md, and camera paths of nerfstudio."""
+"""Camera files: the JSON format of docs/cameras.md, and nerfstudio's camera paths."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ FORMAT = "wildgs-cameras-1"
 DATAPARSER_FILE = "dataparser_transforms.json"
 DEFAULT_FPS = 30.0
 MAX_SIDE = 32_768
-"""Upper bound on width and height in pixels, since images of this size are allocated."""
+"""Maximum width and height in pixels, since images of this size are allocated."""
 LEAST_FOCAL, MAX_INTRINSIC = 1e-3, 1e9
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A camera path from a file: a camera per video frame, all of one size, and their world frame."""
+    """A camera path: one camera per video frame, all of the same size, and their world frame."""
 
     cameras: tuple[Camera, ...]
     fps: float
@@ -79,7 +79,7 @@ def read_camera_path(file: Path) -> CameraPath:
         elif isinstance(content, dict) and "cameras" in content:
             path = _from_own(content)
         else:
-            raise ValueError("neither 'cameras' (Wild-GS) nor 'camera_path' (nerfstudio) is there")
+            raise ValueError("it has neither 'cameras' (Wild-GS) nor 'camera_path' (nerfstudio)")
     except (KeyError, TypeError, ValueError, OSError, OverflowError, RecursionError) as error:
         reason = f"missing entry {error}" if isinstance(error, KeyError) else error
         raise UserError(f"{file}: not a valid camera file: {reason} (see docs/cameras.md)") from error
@@ -103,10 +103,11 @@ def _from_own(content: dict[str, Any]) -> CameraPath:
 
 
 def _from_nerfstudio(content: dict[str, Any], transforms: Path) -> CameraPath:
-    """Camera path of nerfstudio: camera-to-world with OpenGL axes, vertical field of view.
+    """Converts nerfstudio's camera path: camera-to-world with OpenGL axes, vertical field of view.
 
-    Its world frame is that of its data parser. If the transform of the parser is beside the file, cameras are
-    transformed to the frame of the COLMAP model; otherwise they are assumed to be in the frame of this run.
+    Its world frame is that of nerfstudio's data parser. If the file with the parser's transform is in the same
+    folder, cameras are transformed to the frame of the COLMAP model; otherwise they are assumed to be in the frame
+    of this run.
     """
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
@@ -124,8 +125,8 @@ def _from_nerfstudio(content: dict[str, Any], transforms: Path) -> CameraPath:
         volume = np.linalg.det(pose[:3, :3])
         if not 1e-18 < abs(volume) < 1e18:
             raise ValueError(f"camera_path[{number}]: the pose is not a rigid transform")
-        pose[:3, :3] /= np.cbrt(volume)  # the scale of the parser applies to positions only
-        pose[:3, 1:3] *= -1  # OpenGL's y up and z backward to OpenCV's
+        pose[:3, :3] /= np.cbrt(volume)  # the parser's scale applies to positions only
+        pose[:3, 1:3] *= -1  # from OpenGL (y up, z backward) to OpenCV (y down, z forward)
         K = _from_fov(entry["fov"], width, height)
         cameras.append(_camera(np.linalg.inv(pose), K, width, height))
     return CameraPath(tuple(cameras), _speed(content), "colmap" if transforms.is_file() else "scene")

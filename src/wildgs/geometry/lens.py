@@ -18,7 +18,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of all cameras of a trajectory; `focal` is relative to the longer side, sizes are in pixels."""
+    """Shared intrinsics of a trajectory; `focal` is relative to the longer side, sizes are in pixels."""
 
     focal: float
     width: int
@@ -28,13 +28,13 @@ class Lens:
         """An upright camera at a position, looking along `forward` (of any length), all in world coordinates."""
         z_axis = unit(forward)
         x_axis = np.cross(z_axis, up)
-        if np.linalg.norm(x_axis) < 1e-6:  # looking straight up or down: any horizontal axis will do
+        if np.linalg.norm(x_axis) < 1e-6:  # looking straight up or down: the horizontal axis is arbitrary
             x_axis = np.cross(z_axis, np.array([0.0, 1.0, 0.0]))
         x_axis = unit(x_axis)
         return self.posed(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis]), position)
 
     def posed(self, rotation: Float64[np.ndarray, "3 3"], position: Vector) -> Camera:
-        """A camera with given axes: the rows x right, y down, z forward."""
+        """A camera whose axes (x right, y down, z forward) are the rows of `rotation`."""
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
         return Camera(torch.from_numpy(viewmat).float(), self.intrinsics(), self.width, self.height)
@@ -73,8 +73,8 @@ def forwards_of(cameras: Sequence[Camera]) -> Float64[np.ndarray, "V 3"]:
 def focus(cameras: Sequence[Camera], centre: Vector, rounds: int = 10) -> Vector:
     """The point nearest to the viewing axes of all cameras, by iteratively reweighted least squares.
 
-    `centre` is a weak prior, which decides where the axes do not (parallel cameras); reweighting suppresses
-    cameras that look elsewhere.
+    `centre` is a weak prior that resolves ambiguity (parallel cameras); reweighting suppresses cameras that look
+    elsewhere.
     """
     positions, forwards = positions_of(cameras), forwards_of(cameras)
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]

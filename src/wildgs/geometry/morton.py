@@ -1,4 +1,4 @@
-"""Morton order: points that are close in space are close in memory."""
+"""Morton order: sorts points so that neighbours in space are close in memory."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MAX_BITS = 21
-"""Three coordinates of this many bits fit into 64 bits."""
+"""Maximum number of bits per coordinate, so that three coordinates fit into 64 bits."""
 
 
 def morton_order(points: Float[Tensor, "N 3"], *, bits: int = 10, outside: float = 0.02) -> Int[Tensor, " N"]:
     """Indices that sort points along the Z-order curve (Morton 1966).
 
-    The cells of the curve divide a bounding box of most points; points outside belong to the nearest cell at its
-    border. Points of one cell keep their order.
+    The curve divides a bounding box of most points into cells; points outside belong to the nearest cell. Points in
+    the same cell keep their order.
 
     Args:
         points: World coordinates; NaN sorts first.
         bits: The box has ``2**bits`` cells per side; at most 21.
-        outside: Share of the points outside the box on each side of each axis.
+        outside: Share of the points that lie outside the box on each side of each axis.
     """
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.long, device=points.device)

@@ -73,11 +73,11 @@ def sh_basis(degree: int, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor
 
 
 def sh_values(sh: Float[Tensor, "N K 3"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Harmonics seen from one direction each, without the offset and the clamp of `wildgs.rasterize.sh_to_colors`.
+    """Evaluates harmonics in one direction each, without the offset and clamp of `wildgs.rasterize.sh_to_colors`.
 
     Args:
-        sh: Coefficients of all degrees up to one.
-        directions: From the camera's centre to the Gaussians, of any length.
+        sh: Coefficients; their number determines the degree.
+        directions: Directions from the camera's centre to the Gaussians; they need not be normalised.
     """
     bases = sh_basis(sh_degree(sh), functional.normalize(directions, dim=-1))
     return torch.einsum("nk, nkc -> nc", bases, sh)
@@ -100,10 +100,10 @@ def sh_degree(sh: Float[Tensor, "N K 3"]) -> int:
 
 
 def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "N K 3"]:
-    """Coefficients of the same colours in a rotated world.
+    """Rotates coefficients with the world.
 
-    The rotated coefficients give in direction ``rotation @ d`` what the given ones give in ``d``. Each degree is
-    closed under rotation, so its matrix follows exactly, by least squares over enough directions.
+    The rotated coefficients have in direction ``rotation @ d`` the values of the given ones in ``d``. Each degree
+    is closed under rotation, so least squares over enough directions gives its matrix exactly.
 
     Args:
         sh: Coefficients in the order of 3D Gaussian Splatting.
@@ -128,7 +128,7 @@ def rotate_sh(sh: Float[Tensor, "N K 3"], rotation: Float[Tensor, "3 3"]) -> Flo
 def truncate_sh(
     sh: Float[Tensor, "N K 3"], degree: int, fit: Float[Tensor, "N L M"] | None = None
 ) -> Float[Tensor, "N L 3"]:
-    """Coefficients of a lower degree; those of this degree or a lower one are returned unchanged.
+    """Truncates coefficients to a degree; coefficients of this degree or lower are returned unchanged.
 
     A `fit` of `fit_truncation` for the same degrees preserves the colours in the directions of the cameras.
     Without it the higher degrees are dropped, which is best on average over all directions.
@@ -155,9 +155,9 @@ def fit_truncation(
 ) -> Float[Tensor, "N L M"]:
     """Least-squares correction of the remaining degrees when higher ones are dropped, per Gaussian.
 
-    Photos of a landmark are taken from one side of it. In these directions the higher degrees are mostly a constant
-    and a slope, which plain truncation loses. Least squares over the directions from the cameras moves them into
-    the remaining coefficients, with a weak prior towards plain truncation.
+    Photos of a landmark are taken from one side of it. Over these directions, the higher degrees contribute mostly
+    a constant and a slope, which plain truncation loses. Least squares over the directions from the cameras moves
+    them to the remaining coefficients, with a weak prior towards plain truncation.
 
     Args:
         means: Centres of the Gaussians.

@@ -15,7 +15,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.geometry.lens import Lens, Vector, focal_of, focus, forwards_of, positions_of, unit, usual_lens
 
 FULL_CIRCLE_GAP = 75.0
-"""Degrees: an orbit is a full circle if no gap between the cameras is wider than this."""
+"""An orbit is a full circle if no gap between the cameras is wider than this, in degrees."""
 
 TOUR_STOPS = 16
 """Number of photos that a training path passes."""
@@ -36,7 +36,7 @@ def interpolate(cameras: Sequence[Camera], frames: int, width: int, height: int)
     knots, logs = [0.0], [focal[0]]
     for camera, log_focal in zip(cameras[1:], focal[1:], strict=True):
         length = _distance(kept[-1], camera) + abs(log_focal - logs[-1])
-        if length > 1e-9:  # the same camera twice is one stop
+        if length > 1e-9:  # consecutive identical cameras are merged
             kept.append(camera)
             knots.append(knots[-1] + length)
             logs.append(log_focal)
@@ -74,10 +74,10 @@ def _gentle(frames: int, ramp: float = 0.15) -> Float64[np.ndarray, " F"]:
 def training_path(
     cameras: Sequence[Camera], points: Float[np.ndarray, "P 3"], frames: int, width: int, height: int
 ) -> list[Camera]:
-    """A smooth walk past the camera positions of the photos, looking where they look.
+    """A smooth path past the camera positions of the photos, with their viewing directions.
 
-    Photo collections are unordered; the order is a short tour through photos chosen by farthest-point sampling.
-    Photos from far away and photos that look elsewhere are ignored.
+    Since photo collections are unordered, photos are chosen by farthest-point sampling and connected by a short
+    tour. Photos from far away and photos that look elsewhere are ignored.
     """
     target = focus(cameras, np.median(points, axis=0).astype(np.float64))
     usual = _usual_cameras(cameras, target)
@@ -105,7 +105,7 @@ def _usual_cameras(cameras: Sequence[Camera], target: Vector) -> list[Camera]:
 
 
 def _smooth(stops: Float64[np.ndarray, "S 3"], frames: int) -> Float64[np.ndarray, "F 3"]:
-    """A smoothed curve past the stops, uniform in time between them."""
+    """A smooth curve past the stops, uniform in time between them."""
     if len(stops) == 1:
         return np.repeat(stops, frames, axis=0)
     fine = 40 * len(stops)
@@ -192,7 +192,7 @@ def spiral(
 def spread_out(features: Float64[np.ndarray, "V D"], count: int) -> list[int]:
     """Farthest-point sampling: indices of at most `count` rows, each the farthest from those before.
 
-    The first is the row nearest to the median, so that no outlier decides.
+    The first is the row nearest to the median, which is robust to outliers.
     """
     chosen = [int(np.linalg.norm(features - np.median(features, axis=0), axis=1).argmin())]
     distance = np.linalg.norm(features - features[chosen[0]], axis=1)

@@ -1,7 +1,7 @@
 """Monocular disparity by Depth Anything V2 (Yang et al., NeurIPS 2024): the paper's depth prior.
 
-The network gives disparity of unknown scale and shift (large = near). It is kept as 16-bit pictures in the
-scene's `depth/` folder, where the depth loss finds it.
+The network predicts disparity up to an unknown scale and shift (large = near). It is stored as 16-bit images in the
+scene's `depth/` folder, from which the depth loss reads it.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.scene.photo_store import depth_files
 
 NETWORK_SIZE = 518
-"""Side at which the network was trained; its 37 x 37 patches."""
+"""Training resolution of the network in pixels per side: 37 x 37 patches."""
 STORED_SIZE = 1036
-"""Long side of the stored disparity at most: the network sees no finer detail."""
+"""Maximum long side of the stored disparity; the network resolves no finer detail."""
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
 class DepthEstimator:
-    """Depth Anything with its preparation of the picture.
+    """Depth Anything with its image preprocessing.
 
     Attributes:
         model: The transformers network, in evaluation mode.
-        patch_size: Side of the network's patches, pixels; its input is a multiple.
+        patch_size: Side of the network's patches in pixels; the input size is a multiple of it.
     """
 
     model: torch.nn.Module
     patch_size: int = 14
 
     def estimate(self, photo: UInt8[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
-        """Disparity of a photo, at the photo's size.
+        """Estimates the disparity of a photo, at the photo's resolution.
 
         Args:
-            photo: Colours, upright.
+            photo: RGB, upright.
 
         Returns:
-            Disparity (large = near) in the network's own units, at least 0; near 0 in the sky. On the CPU.
+            Non-negative disparity (large = near, about 0 in the sky) in the network's units, on the CPU.
         """
         device = next(self.model.parameters()).device
         height, width = photo.shape[:2]
@@ -69,10 +69,10 @@ class DepthEstimator:
         return disparity[0, 0].clamp_min(0.0).cpu().clone()
 
     def network_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width at which the network sees a picture.
+        """Input height and width of the network for an image.
 
-        As its published preparation: one scale for both axes, that of the side which needs less scaling to
-        reach 518 pixels, then each rounded to whole patches.
+        Follows the published preprocessing: both axes are scaled by the factor closest to 1 that brings one side
+        to 518 pixels, then each side is rounded to whole patches.
         """
         scale = min(NETWORK_SIZE / height, NETWORK_SIZE / width, key=lambda factor: abs(1.0 - factor))
         patch = self.patch_size
@@ -85,25 +85,25 @@ class DepthEstimator:
 def load_depth_anything(
     source: str | None = None, *, device: str | None = None, required: bool = False
 ) -> DepthEstimator | None:
-    """Depth Anything V2 (small) from a folder, the hub's cache or the hub.
+    """Loads Depth Anything V2 (small) from a folder, the Hugging Face cache or the hub.
 
     Args:
-        source: A folder in the hub's layout, or a name on the hub; None = the published small network.
-        device: Where it runs; None = CUDA where there is one, else the CPU.
-        required: Raise where it cannot be had, instead of warning.
+        source: A folder in the hub's layout, or a model name on the hub; None = the published small network.
+        device: Device of the network; None = CUDA if available, else the CPU.
+        required: Raise an error instead of warning if the network is not available.
 
     Returns:
-        The network; None where it cannot be had (one warning says what is lost and how to get it).
+        The network; None if it is not available (a warning tells the consequences and how to get it).
 
     Raises:
-        UserError: `source` is a folder without such a network; or it cannot be had and is `required`.
+        UserError: `source` is a folder without such a network; or the network is `required` but not available.
     """
     source = source or DEPTH_ANYTHING
     model = _find_model(source)
     if model is None:
         message = (
-            f"Depth Anything ({source}) is neither a folder, nor cached, nor to be had from the hub: there is"
-            f" no depth prior but what depth/ holds; get it with `hf download {source}`, give its folder,"
+            f"Depth Anything ({source}) is neither a folder nor cached, and the hub is not reachable; only"
+            f" depth maps already in depth/ are used. Download it with `hf download {source}`, give its folder,"
             " or use `wildgs depth --by stereo`"
         )
         if required:
@@ -133,7 +133,7 @@ def _find_model(source: str) -> Any | None:
             return None
     try:
         return _load(source, local=False)
-    except Exception:  # and here: 'not to be had'
+    except Exception:  # likewise: all mean 'not available'
         return None
 
 
@@ -167,19 +167,19 @@ def fill_depth_folder(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[int, int]:
-    """Write the depth prior of every photo of a scene's model (see `depth_files`).
+    """Writes the depth prior of every photo of a scene's model (see `depth_files`).
 
     Args:
         root: The scene's folder.
-        estimator: Gives disparity.
-        overwrite: Estimate again what is already there.
-        progress: Called with (photos done, photos in all).
+        estimator: The network.
+        overwrite: Replace existing files.
+        progress: Called with (photos done, total).
 
     Returns:
-        How many were written, and how many were there before.
+        The number of files written, and the number that already existed.
 
     Raises:
-        UserError: There is no scene.
+        UserError: The folder contains no scene.
     """
     model = read_model(root)
     targets = depth_files(root, [image.name for image in model.images])
@@ -207,7 +207,7 @@ def fill_depth_folder(
 
 
 def _to_16_bits(disparity: Float[Tensor, "H W"]) -> UInt16[np.ndarray, "h w"]:
-    """Stretched so that the nearest pixel is 65535, shrunk to what the network resolves."""
+    """Scales the values so that the nearest pixel is 65535, and the size to at most `STORED_SIZE`."""
     height, width = disparity.shape
     shrink = STORED_SIZE / max(height, width)
     if shrink < 1.0:

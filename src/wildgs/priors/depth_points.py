@@ -1,8 +1,9 @@
-"""Points where structure from motion found none: from metric depth and from depth priors, brought to its scale.
+"""Initial points from metric depth and depth priors, for surfaces on which SfM found no points.
 
-Paving, lawns and bare walls have no features that SIFT could match between photos of different light, so no
-Gaussian starts there; a monocular network sees them all the same. Each photo's disparity is fitted to the SfM
-points that the photo sees, and only what several photos agree on is kept, so that passers-by are left out.
+Paving, lawns and bare walls have no features that SIFT can match between photos in different lighting, so no
+Gaussians are initialised there; a monocular depth network covers them nevertheless. The disparity of each photo is
+aligned to the SfM points visible in it. Only points on which several photos agree are kept, which excludes
+passers-by.
 """
 
 from __future__ import annotations
@@ -19,24 +20,22 @@ from wildgs.priors.config import DepthPointsConfig
 from wildgs.scene.scene import Scene, View
 
 MAX_PHOTOS = 200
-"""Photos that are asked; of larger scenes evenly many over the list."""
+"""Maximum number of photos that are used; larger scenes are subsampled evenly."""
 
 METRIC_VOTES = 3
+"""Votes of a photo with metric depth, which several photos already agreed on; a depth prior has one."""
 METRIC_CELL = 0.5
-"""Side of the cells of metric depth, as a share of those in which depth priors have to agree."""
+"""Side of the voting cells of metric depth, relative to those of depth priors."""
 _HYPOTHESES = 256
 _TOLERANCE = 0.05
 _MIN_POINTS, _MIN_INLIERS = 24, 0.4
-_MAX_POINTS = 20_000  # of a photo; more make no better fit and a table of 256 times as many numbers
-_MIN_CORRELATION = 0.7  # where all is about as far, a constant fits, and says nothing of what lies between
+_MAX_POINTS = 20_000  # per photo; more do not improve the fit, and memory is 256 times as many numbers
+_MIN_CORRELATION = 0.7  # at nearly constant depth, a constant fits too, but does not determine the scale
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What one photo says: some of its pixels as points, and its depth at every `step`-th pixel, 0 for nothing.
-
-    Metric depth has `METRIC_VOTES`: photos agreed on it already.
-    """
+class _PhotoDepth:
+    """Depth of one photo: the pixels with depth as points, and a depth map of every `step`-th pixel (0 = none)."""
 
     points: Float[Tensor, "S 3"]
     colors: Float[Tensor, "S 3"]
@@ -49,28 +48,28 @@ class _Seen:
 def depth_points(
     scene: Scene, config: DepthPointsConfig, seed: int = 0
 ) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"]]:
-    """Points of surfaces that several training photos see and SfM has no point of.
+    """Computes points of surfaces that several training photos show but that have no SfM points.
 
     Args:
-        scene: With depth priors; photos without one, or whose disparity does not fit the points, are passed over.
-        config: What counts as agreement.
-        seed: Of the choice among too many points.
+        scene: A scene with depth priors; photos without one, or whose disparity cannot be aligned, are skipped.
+        config: Thresholds of agreement.
+        seed: Seed of the random subset if there are more than `config.points` points.
 
     Returns:
-        Positions in the aligned frame, and colours (the mean over photos). Empty where nothing is to be had.
+        Positions in the aligned frame, and colours (mean over photos). Empty if no depth is available.
     """
-    nothing = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
+    empty = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
     if config.points == 0:
-        return nothing
+        return empty
     generator = torch.Generator().manual_seed(seed)
-    views = _evenly(scene.train_views)
-    photos = [seen for view in views for seen in _look(view, scene.points, config, generator)]
-    known, parts = scene.points, [nothing]
+    views = _subsample(scene.train_views)
+    photos = [photo for view in views for photo in _photo_depths(view, scene.points, config, generator)]
+    existing, parts = scene.points, [empty]
     for votes, cell in ((METRIC_VOTES, METRIC_CELL * config.cell), (1, config.cell)):
-        asked = [seen for seen in photos if seen.votes == votes]
-        if asked:
-            parts.append(_agreed(asked, photos, known, cell, config))
-            known = torch.cat([known, parts[-1][0]])
+        sources = [photo for photo in photos if photo.votes == votes]
+        if sources:
+            parts.append(_agreed_points(sources, photos, existing, cell, config))
+            existing = torch.cat([existing, parts[-1][0]])
     means, colors = (torch.cat(both) for both in zip(*parts, strict=True))
     if len(means) > config.points:
         chosen = torch.randperm(len(means), generator=generator)[: config.points].sort().values
@@ -78,34 +77,37 @@ def depth_points(
     return means, colors
 
 
-def _agreed(
-    asked: Sequence[_Seen],
-    photos: Sequence[_Seen],
-    known: Float[Tensor, "K 3"],
+def _agreed_points(
+    sources: Sequence[_PhotoDepth],
+    photos: Sequence[_PhotoDepth],
+    existing: Float[Tensor, "K 3"],
     cell: float,
     config: DepthPointsConfig,
 ) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"]]:
-    """A point for each cell of what some photos see, where enough photos agree and no point is known."""
-    points, colors = torch.cat([seen.points for seen in asked]), torch.cat([seen.colors for seen in asked])
-    sources = torch.cat([torch.full((len(seen.points),), index) for index, seen in enumerate(asked)])
-    votes = torch.tensor([seen.votes for seen in asked])
-    means, means_of_color, support = _by_cell(points, colors, sources, votes, cell)
-    kept = (support >= config.support) & ~_near(means, known, cell)
-    means, means_of_color, support = means[kept], means_of_color[kept], support[kept]
-    kept = support >= config.agreement * (support + _seen_through(means, photos, config.cell))
-    return means[kept], means_of_color[kept].round().clamp(0, 255).to(torch.uint8)
+    """One point per cell of the sources' points, where enough of them agree and no point exists yet."""
+    points, colors = (
+        torch.cat([seen.points for seen in sources]),
+        torch.cat([seen.colors for seen in sources]),
+    )
+    indices = torch.cat([torch.full((len(seen.points),), index) for index, seen in enumerate(sources)])
+    votes = torch.tensor([seen.votes for seen in sources])
+    means, mean_colors, support = _average_cells(points, colors, indices, votes, cell)
+    kept = (support >= config.support) & ~_share_cell(means, existing, cell)
+    means, mean_colors, support = means[kept], mean_colors[kept], support[kept]
+    kept = support >= config.agreement * (support + _contradictions(means, photos, config.cell))
+    return means[kept], mean_colors[kept].round().clamp(0, 255).to(torch.uint8)
 
 
-def _evenly(views: Sequence[View]) -> list[View]:
+def _subsample(views: Sequence[View]) -> list[View]:
     if len(views) <= MAX_PHOTOS:
         return list(views)
     return [views[round(index)] for index in torch.linspace(0, len(views) - 1, MAX_PHOTOS).tolist()]
 
 
-def _looked_up(
+def _sample_at(
     points: Float[Tensor, "P 3"], camera: Camera, picture: Float[Tensor, "h w"], step: int = 1
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
-    """Depth of every point, and what a picture (of every `step`-th pixel) has there: 0 for points outside it."""
+    """Depth of each point, and the value of an image (of every `step`-th pixel) at its pixel; 0 outside."""
     pixels, z = camera.project(points)
     size = torch.tensor([camera.width, camera.height])
     inside = (z > 1e-3) & ((pixels >= 0) & (pixels < size)).all(dim=1)
@@ -113,29 +115,31 @@ def _looked_up(
     return z, torch.where(inside, picture[y, x], 0.0)
 
 
-def _look(
+def _photo_depths(
     view: View, points: Float[Tensor, "P 3"], config: DepthPointsConfig, generator: torch.Generator
-) -> Iterator[_Seen]:
-    """What a photo says in the scene's scale: by metric depth, and by its disparity where that knows nothing."""
+) -> Iterator[_PhotoDepth]:
+    """Depth of a photo in the scene's scale: metric depth, and aligned disparity where metric depth is missing."""
     metric, disparity = view.read_depth(), view.read_disparity()
     if metric is not None:
-        yield _sampled(view, metric, METRIC_VOTES, config)
+        yield _to_points(view, metric, METRIC_VOTES, config)
     if disparity is None:
         return
-    fitted = _scaled(view.camera, disparity, metric, points, generator)
-    if fitted is not None:
-        yield _sampled(view, fitted if metric is None else torch.where(metric > 0, 0.0, fitted), 1, config)
+    aligned = _align(view.camera, disparity, metric, points, generator)
+    if aligned is not None:
+        yield _to_points(
+            view, aligned if metric is None else torch.where(metric > 0, 0.0, aligned), 1, config
+        )
 
 
-def _scaled(
+def _align(
     camera: Camera,
     disparity: Float[Tensor, "H W"],
     metric: Float[Tensor, "H W"] | None,
     points: Float[Tensor, "P 3"],
     generator: torch.Generator,
 ) -> Float[Tensor, "H W"] | None:
-    """A disparity as depth, by the points and the metric depth of its photo; None where it fits neither."""
-    z, sampled = _looked_up(points, camera, disparity)
+    """Converts disparity to depth by a fit to the photo's points and metric depth; None if the fit fails."""
+    z, sampled = _sample_at(points, camera, disparity)
     z, sampled = z[sampled > 0], sampled[sampled > 0]
     if metric is not None:
         both = (metric > 0) & (disparity > 0)
@@ -144,95 +148,103 @@ def _scaled(
     if fit is None:
         return None
     inverse = fit[0] * disparity + fit[1]
-    # Beyond the farthest points that were fitted, a small error of the disparity is a large one of depth.
+    # Beyond the farthest fitted points, a small error of the disparity causes a large error of the depth.
     reliable = (disparity > 0) & (inverse * z.sort().values[int(0.98 * (len(z) - 1))] > 1)
     return torch.where(reliable, 1 / inverse.clamp_min(1e-6), 0.0)
 
 
-def _sampled(view: View, depth: Float[Tensor, "H W"], votes: int, config: DepthPointsConfig) -> _Seen:
-    # Two to a cell's side at the usual depth.
+def _to_points(view: View, depth: Float[Tensor, "H W"], votes: int, config: DepthPointsConfig) -> _PhotoDepth:
+    # Two samples per side of a cell at the median depth, which is 1.
     cell = METRIC_CELL * config.cell if votes == METRIC_VOTES else config.cell
     step = max(1, int(0.5 * cell * float(view.camera.K[0, 0])))
     keep = (depth > 0) & (depth < config.farthest)
     mask = view.read_mask()
     if mask is not None:
         keep = keep & (mask > 0)
-    keep, places = keep[::step, ::step], view.camera.unproject(depth)[::step, ::step]
+    keep, points = keep[::step, ::step], view.camera.unproject(depth)[::step, ::step]
     colors = view.read_photo()[::step, ::step][keep].float()
-    return _Seen(places[keep], colors, view.camera, depth[::step, ::step].contiguous(), step, votes)
+    return _PhotoDepth(points[keep], colors, view.camera, depth[::step, ::step].contiguous(), step, votes)
 
 
 def fit_disparity(
     disparity: Float[Tensor, " P"], inverse_depth: Float[Tensor, " P"], generator: torch.Generator
 ) -> tuple[float, float] | None:
-    """Scale and shift with which disparity is inverse depth, for the most points (RANSAC, then least squares).
+    """Fits the scale and shift from disparity to inverse depth (RANSAC, then least squares on the inliers).
 
-    Points behind what the photo shows, and passers-by before them, do not fit.
+    Outliers are points occluded in the photo, for example by passers-by.
 
     Returns:
-        (scale, shift), or None where too few points fit, or disparity does not grow with nearness.
+        (scale, shift); None if there are too few inliers or disparity does not increase with inverse depth.
     """
     count = len(disparity)
     if count < _MIN_POINTS:
         return None
     if count > _MAX_POINTS:
-        some = torch.randperm(count, generator=generator)[:_MAX_POINTS]
-        disparity, inverse_depth, count = disparity[some], inverse_depth[some], _MAX_POINTS
+        subset = torch.randperm(count, generator=generator)[:_MAX_POINTS]
+        disparity, inverse_depth, count = disparity[subset], inverse_depth[subset], _MAX_POINTS
     pairs = torch.randint(count, (2, _HYPOTHESES), generator=generator)
-    run = disparity[pairs[0]] - disparity[pairs[1]]
-    scale = (inverse_depth[pairs[0]] - inverse_depth[pairs[1]]) / torch.where(run.abs() > 1e-9, run, 1e-9)
+    difference = disparity[pairs[0]] - disparity[pairs[1]]
+    difference = torch.where(difference.abs() > 1e-9, difference, 1e-9)
+    scale = (inverse_depth[pairs[0]] - inverse_depth[pairs[1]]) / difference
     shift = inverse_depth[pairs[0]] - scale * disparity[pairs[0]]
-    fits = _fits(disparity, inverse_depth, scale[:, None], shift[:, None]) & (scale[:, None] > 0)
-    best = fits[int(fits.sum(dim=1).argmax())]
+    inliers = _inliers(disparity, inverse_depth, scale[:, None], shift[:, None]) & (scale[:, None] > 0)
+    best = inliers[int(inliers.sum(dim=1).argmax())]
     for _ in range(2):
         if float(best.float().mean()) < _MIN_INLIERS:
             return None
         rows = torch.stack([disparity[best], torch.ones(int(best.sum()))], dim=1).double()
-        weights = 1 / inverse_depth[best].double()[:, None]  # relative errors count
-        solved = torch.linalg.lstsq(rows * weights, torch.ones_like(weights)).solution[:, 0]
-        slope, offset = float(solved[0]), float(solved[1])
-        best = _fits(disparity, inverse_depth, slope, offset)
+        weights = 1 / inverse_depth[best].double()[:, None]  # minimises relative errors
+        solution = torch.linalg.lstsq(rows * weights, torch.ones_like(weights)).solution[:, 0]
+        slope, offset = float(solution[0]), float(solution[1])
+        best = _inliers(disparity, inverse_depth, slope, offset)
     if int(best.sum()) < _MIN_POINTS // 2:
         return None
-    together = torch.corrcoef(torch.stack([disparity[best], inverse_depth[best]]))[0, 1]
-    return (slope, offset) if slope > 0 and float(together) > _MIN_CORRELATION else None
+    correlation = torch.corrcoef(torch.stack([disparity[best], inverse_depth[best]]))[0, 1]
+    return (slope, offset) if slope > 0 and float(correlation) > _MIN_CORRELATION else None
 
 
-def _fits(disparity: Tensor, inverse_depth: Tensor, scale: Tensor | float, shift: Tensor | float) -> Tensor:
+def _inliers(
+    disparity: Tensor, inverse_depth: Tensor, scale: Tensor | float, shift: Tensor | float
+) -> Tensor:
     return (scale * disparity + shift - inverse_depth).abs() < _TOLERANCE * inverse_depth
 
 
 def _cells(points: Float[Tensor, "P 3"], cell: float) -> Int[Tensor, " P"]:
-    """A number for the cell of every point (the grid spans a million cells a side)."""
+    """Integer key of the cell of every point (the grid has about a million cells per axis)."""
     index = (points / cell).floor().long().clamp(-(2**19), 2**19 - 1) + 2**19
     return (index[:, 0] << 40) | (index[:, 1] << 20) | index[:, 2]
 
 
-def _by_cell(
+def _average_cells(
     points: Float[Tensor, "P 3"],
     colors: Float[Tensor, "P 3"],
     photos: Int[Tensor, " P"],
     votes: Int[Tensor, " S"],
     cell: float,
 ) -> tuple[Float[Tensor, "C 3"], Float[Tensor, "C 3"], Int[Tensor, " C"]]:
-    """Mean place and colour of each cell's points, and the votes of the photos they are from."""
+    """Mean position and colour of the points of each cell, and the votes of their photos."""
     keys, member = torch.unique(_cells(points, cell), return_inverse=True)
-    number = torch.zeros(len(keys)).index_add_(0, member, torch.ones(len(points)))[:, None]
-    places = torch.zeros(len(keys), 3).index_add_(0, member, points) / number
-    means = torch.zeros(len(keys), 3).index_add_(0, member, colors) / number
+    count = torch.zeros(len(keys)).index_add_(0, member, torch.ones(len(points)))[:, None]
+    positions = torch.zeros(len(keys), 3).index_add_(0, member, points) / count
+    means = torch.zeros(len(keys), 3).index_add_(0, member, colors) / count
     pairs = torch.unique(torch.stack([member, photos]), dim=1)
-    return places, means, torch.zeros(len(keys), dtype=torch.int64).index_add_(0, pairs[0], votes[pairs[1]])
+    support = torch.zeros(len(keys), dtype=torch.int64).index_add_(0, pairs[0], votes[pairs[1]])
+    return positions, means, support
 
 
-def _near(points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"], cell: float) -> Bool[Tensor, " P"]:
-    """Whether a point shares its cell with one of the others."""
+def _share_cell(
+    points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"], cell: float
+) -> Bool[Tensor, " P"]:
+    """Whether each point shares its cell with one of the others."""
     return torch.isin(_cells(points, cell), _cells(others, cell))
 
 
-def _seen_through(points: Float[Tensor, "P 3"], photos: Sequence[_Seen], cell: float) -> Int[Tensor, " P"]:
-    """How many photos see something clearly beyond each point."""
-    through = torch.zeros(len(points), dtype=torch.int64)
-    for seen in photos:
-        z, depth = _looked_up(points, seen.camera, seen.depth, seen.step)
-        through += depth > (1 + 2 * _TOLERANCE) * z + cell
-    return through
+def _contradictions(
+    points: Float[Tensor, "P 3"], photos: Sequence[_PhotoDepth], cell: float
+) -> Int[Tensor, " P"]:
+    """Number of photos whose depth at each point lies clearly behind it."""
+    count = torch.zeros(len(points), dtype=torch.int64)
+    for photo in photos:
+        z, depth = _sample_at(points, photo.camera, photo.depth, photo.step)
+        count += depth > (1 + 2 * _TOLERANCE) * z + cell
+    return count

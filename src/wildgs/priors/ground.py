@@ -1,7 +1,7 @@
-"""The ground where nothing is known of it: the plane that known ground lies in, continued around the cameras.
+"""Ground completion: fits a plane to the ground points and continues it around the cameras.
 
-Photographers look up at a landmark, and of the paving at their feet few photos show any one place. What none or one
-of them shows has no points, and a view that looks there sees through the scene to whatever lies behind.
+Photos of a landmark rarely show the paving in front of the photographer. SfM cannot triangulate surfaces that fewer
+than two photos show, so a novel view in that direction would see through the scene to the background.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from wildgs.priors.config import GroundConfig
 
 _HYPOTHESES = 512
 _STEEPEST = 0.15
-"""Slope of a ground, at most: steeper planes are walls, roofs and flights of stairs."""
+"""Maximum slope of the ground; steeper planes are walls, roofs or flights of stairs."""
 _LEAST_SHARE = 0.2
-"""Of the points below the cameras, that lie in the plane: less is no ground but some level thing."""
+"""Minimum share of inliers among the points below the cameras; a plane with fewer is some other level surface."""
 _LEAST_ABOVE = 0.9
-"""Of the cameras, that stand above it."""
+"""Minimum share of the cameras above the plane."""
 _LEAST_POINTS = 50
 _MAX_CELLS = 2_000_000
-"""Places of the grid, at most: of a grid that would have more, only those around the cameras are looked at."""
-_MAX_POINTS = 20_000  # in the search; more make no better plane and a table of 512 times as many numbers
+"""Maximum number of grid cells; in a larger grid, only cells around the cameras are considered."""
+_MAX_POINTS = 20_000  # for RANSAC; more do not improve the plane, and memory is 512 times as many numbers
 
 
 def ground_points(
@@ -35,17 +35,17 @@ def ground_points(
     config: GroundConfig,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "G 3"], UInt8[Tensor, "G 3"]]:
-    """Points that continue the ground where it has none.
+    """Generates points that continue the ground plane where the scene has no points.
 
     Args:
-        points: What is known of the scene, in the aligned frame (+z up).
-        colors: Its colours; new points take those of the nearest known ground.
-        centers: Where the cameras are.
-        config: How many, how dense, how far.
-        seed: Of the search for the plane.
+        points: Points of the scene in the aligned frame (+z up).
+        colors: Colours of the points; new points take the colour of the nearest ground point.
+        centers: Camera centres.
+        config: Number, spacing and extent of the new points.
+        seed: Seed of the plane search.
 
     Returns:
-        Positions and colours. Empty where the points show no ground.
+        Positions and colours of the new points. Empty if no ground plane is found.
     """
     nothing = points[:0], colors[:0]
     if config.points == 0 or len(centers) == 0:
@@ -65,10 +65,10 @@ def ground_points(
 
 
 def _places_around(feet: Float[Tensor, "V 2"], config: GroundConfig) -> Float[Tensor, "G 2"]:
-    """A grid of places, row by row, within reach of the cameras.
+    """Grid positions within reach of the cameras, row by row.
 
-    Of cameras that stand so far apart that the whole grid is too large, only the cells around each are taken: a
-    stray camera costs no more than any other.
+    If the cameras are so far apart that the whole grid would be too large, only cells around each camera are
+    returned, so that a stray camera does not increase the cost.
     """
     low, high = feet.min(dim=0).values - config.reach, feet.max(dim=0).values + config.reach
     counts = [max(0, math.ceil((float(high[i]) - float(low[i])) / config.spacing)) for i in range(2)]
@@ -87,11 +87,10 @@ def _places_around(feet: Float[Tensor, "V 2"], config: GroundConfig) -> Float[Te
 def find_ground(
     points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"], tolerance: float, generator: torch.Generator
 ) -> Float[Tensor, "3"] | None:
-    """The level plane under the cameras in which most points lie (RANSAC, then least squares).
+    """Finds the level plane below the cameras with the most inliers (RANSAC, then least squares).
 
     Returns:
-        a, b and c of ``z = a x + b y + c``; None where too few points lie in any one plane, or cameras stand below
-        it.
+        a, b and c of ``z = a x + b y + c``; None if every plane has too few inliers, or cameras lie below it.
     """
     below = points[points[:, 2] < centers[:, 2].median()]
     if len(below) < _LEAST_POINTS:
@@ -120,12 +119,12 @@ def find_ground(
 
 
 def _padded(points: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 3"]:
-    """(x, y, 1) of points or places: times a plane's coefficients, its height there."""
+    """(x, y, 1) of points; the product with a plane's coefficients is its height at that position."""
     return torch.cat([points[..., :2], torch.ones_like(points[..., :1])], dim=-1)
 
 
 def _members(
     points: Float[Tensor, "P 3"], planes: Float[Tensor, "H 3"], tolerance: float
 ) -> Bool[Tensor, "H P"]:
-    """Which points lie in each plane."""
+    """Inliers of each plane."""
     return (points[:, 2] - planes @ _padded(points).T).abs() < tolerance

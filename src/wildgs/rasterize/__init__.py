@@ -1,4 +1,4 @@
-"""A differentiable Gaussian rasteriser: one interface; CPU (Numba), CUDA (gsplat) and a dense torch reference."""
+"""Differentiable Gaussian rasteriser: one interface for CPU (Numba), CUDA (gsplat) and a dense torch reference."""
 
 from wildgs.rasterize.dispatch import (
     blend,

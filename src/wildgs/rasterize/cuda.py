@@ -1,4 +1,4 @@
-"""The CUDA backend: gsplat 1.5 behind this package's interface. Imported only when it is asked for."""
+"""The CUDA backend: gsplat 1.5 behind this package's interface. Imported only on demand."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _LEAST_ALPHA = 1e-10
 
 @dataclass(frozen=True)
 class _Tiles:
-    """gsplat's sorted intersections of one picture.
+    """gsplat's sorted tile intersections of one image.
 
     Attributes:
         offsets: Where each tile's list starts.
-        flatten_ids: Gaussians tile by tile, nearest first.
+        flatten_ids: Indices of Gaussians, tile by tile, nearest first.
     """
 
     offsets: Tensor
@@ -31,9 +31,9 @@ class _Tiles:
 
 
 def _finite(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, ...]:
-    """The same Gaussians, with non-finite ones made transparent, whereupon gsplat culls them."""
+    """Makes non-finite Gaussians transparent, so that gsplat culls them."""
     with torch.no_grad():
-        # Finite where all of its terms are: infinity and NaN survive any addition.
+        # A sum is finite only if all of its terms are.
         sound = (means.sum(-1) + quats.sum(-1) + scales.sum(-1) + opacities).isfinite()
         row = sound[:, None]
         turned = row & quats.any(-1, keepdim=True)
@@ -74,7 +74,7 @@ def project(
     offsets = gsplat.isect_offset_encode(intersections, 1, columns, lines).reshape(1, lines, columns)
     # Not [0], whose gradient would be a copy in zeros.
     reach, means2d, depths, conics = (t.squeeze(0) for t in (radii, means2d, depths, conics))
-    # gsplat leaves what is culled unwritten.
+    # gsplat does not initialise the outputs of culled Gaussians.
     seen = (reach > 0).all(-1)
     means2d = torch.where(seen[:, None], means2d, 0)
     depths = torch.where(seen, depths, 0)
@@ -101,7 +101,7 @@ def _projection(
 def blend_tiles(
     projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
 ) -> Rendering:
-    """Blends some of the tiles; in the others, gsplat leaves alpha unwritten."""
+    """Blends only the chosen tiles; gsplat does not initialise alpha in the others."""
     tiles = upload(torch.from_numpy(chosen[None]), colors.device)
     return blend(projection, colors, None, True, tiles)
 
@@ -113,14 +113,14 @@ def blend(
     depth: bool,
     chosen: Bool[Tensor, "1 R S"] | None = None,
 ) -> Rendering:
-    """See `wildgs.rasterize.blend`; `chosen` tiles alone are blended, None blends all."""
+    """See `wildgs.rasterize.blend`; if `chosen` is given, only those tiles are blended."""
     camera, tiles = projection.camera, projection.tiles
     height, width, channels = camera.height, camera.width, colors.shape[1]
     if tiles is None:
         flat = colors.new_zeros(height, width)
         behind = colors.new_zeros(channels) if background is None else background
         return Rendering(behind.expand(height, width, channels), flat, flat.clone())
-    # Depth is one more channel; gsplat does not blend none at all.
+    # Depth is an extra channel; gsplat cannot blend zero channels.
     values = colors
     if depth or channels == 0:
         values = torch.cat([colors, projection.depths[:, None]], dim=1)
@@ -141,8 +141,8 @@ def blend(
 
 
 def _collect_absgrad(centres: Tensor, total: Tensor) -> None:
-    """Adds gsplat's absolute gradients, which its backward pass hangs on its input, to the projection's."""
-    cell = [centres]  # emptied by the hook, so that centres and hook do not keep each other alive
+    """Adds the absolute gradients, which gsplat's backward pass attaches to its input, to the projection's."""
+    cell = [centres]  # emptied by the hook to break the reference cycle between the tensor and its hook
 
     def collect(grad: Tensor) -> None:
         total.add_(cell.pop().absgrad.reshape(-1, 2))  # type: ignore[attr-defined]

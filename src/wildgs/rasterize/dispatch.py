@@ -1,4 +1,4 @@
-"""The public functions of the rasteriser: they check their arguments and call a backend."""
+"""Public functions of the rasteriser: argument checks and dispatch to a backend."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wildgs.rasterize.interface import EPS2D, TILE, BackendName, Projection, Ren
 
 
 def pick_backend(device: torch.device | str) -> BackendName:
-    """The backend that fits tensors on a device: `cuda` (gsplat) for CUDA, else `cpu`."""
+    """Default backend for tensors on a device: `cuda` (gsplat) for CUDA, else `cpu`."""
     return "cuda" if torch.device(device).type == "cuda" else "cpu"
 
 
@@ -26,14 +26,14 @@ def _module(name: BackendName):
     elif name == "reference":
         from wildgs.rasterize import reference as module
     else:
-        raise ValueError(f"there is no rasteriser backend {name!r}; choose 'cpu', 'cuda' or 'reference'")
+        raise ValueError(f"unknown rasteriser backend {name!r}; choose 'cpu', 'cuda' or 'reference'")
     return module
 
 
 def _check(
     name: str, tensor: Tensor, shape: tuple[int | None, ...], like: Tensor, backend: BackendName
 ) -> None:
-    """Shape (None: any size), device and number type of an input."""
+    """Checks the shape (None: any size), device and dtype of an input."""
     fits = tensor.dim() == len(shape) and all(
         s in (None, t) for s, t in zip(shape, tensor.shape, strict=True)
     )
@@ -46,10 +46,10 @@ def _check(
         )
     if backend != "reference" and tensor.dtype != torch.float32:
         raise ValueError(
-            f"{name} is {tensor.dtype}; the backend {backend!r} takes float32 ('reference' takes float64 too)"
+            f"{name} is {tensor.dtype}; the backend {backend!r} needs float32 ('reference' accepts float64 too)"
         )
     if backend == "cpu" and tensor.device.type != "cpu":
-        raise ValueError(f"{name} is on {tensor.device}; the backend 'cpu' takes tensors in main memory")
+        raise ValueError(f"{name} is on {tensor.device}; the backend 'cpu' needs tensors on the CPU")
 
 
 def project(
@@ -66,23 +66,23 @@ def project(
 ) -> Projection:
     """Projects Gaussians into a camera and sorts them into tiles, for any number of `blend` calls.
 
-    Semantics are those of gsplat 1.5's classic mode (`rasterize_mode="classic"`). Gaussians are culled (radius 0,
-    no gradient) that lie before the near plane, reach no pixel, have an opacity below 1/255, or hold a number that
-    is not finite.
+    Semantics are those of gsplat 1.5's classic mode (`rasterize_mode="classic"`). A Gaussian is culled (radius 0,
+    no gradient) if it lies in front of the near plane, touches no pixel, has an opacity below 1/255, or has a
+    non-finite parameter.
 
     Args:
         means: Centres, world units.
-        quats: Orientations (wxyz), of any length but 0.
-        scales: Standard deviations along the own axes, world units, linear (no logarithm).
-        opacities: In [0, 1]; larger ones count as 1.
-        camera: The camera; no gradient flows to it.
-        backend: Which implementation; None takes `cuda` for tensors on CUDA and `cpu` otherwise.
-        near: Depth in world units up to which Gaussians are culled.
+        quats: Orientations (wxyz); they need not be normalised.
+        scales: Standard deviations along the principal axes, world units, linear (no logarithm).
+        opacities: In [0, 1]; larger values are clamped to 1.
+        camera: The camera; it receives no gradient.
+        backend: The implementation; None selects `cuda` for tensors on CUDA and `cpu` otherwise.
+        near: Near plane: depth in world units up to which Gaussians are culled.
         absgrad: Collect absolute screen gradients in `Projection.absgrad` during the backward pass.
         eps2d: Added to the diagonal of the 2D covariances, square pixels.
 
     Raises:
-        ValueError: Shapes, devices or number types do not fit, or there is no such backend.
+        ValueError: Shapes, devices or dtypes do not match, or the backend is unknown.
         UserError: The backend is not installed.
     """
     backend = backend or pick_backend(means.device)
@@ -96,7 +96,7 @@ def project(
     ):
         _check(name, tensor, shape, means, backend)
     if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"the camera's picture has no pixels: {camera.width} x {camera.height}")
+        raise ValueError(f"the camera's image has no pixels: {camera.width} x {camera.height}")
     return module.project(means, quats, scales, opacities, camera, near, absgrad, eps2d)
 
 
@@ -107,19 +107,19 @@ def blend(
     background: Float[Tensor, "C"] | None = None,
     depth: bool = True,
 ) -> Rendering:
-    """Blends values per Gaussian front to back over a projection's tile lists.
+    """Alpha-blends per-Gaussian values front to back over a projection's tile lists.
 
-    Gradients flow to the colours, the background and the projection's means2d, conics, depths and opacities.
-    Where nothing needs them (`torch.no_grad()`), nothing is kept for a backward pass.
+    Gradients flow to the colours, the background and the projection's means2d, conics, depths and opacities. If no
+    gradient is required (`torch.no_grad()`), nothing is saved for a backward pass.
 
     Args:
         projection: From `project`; may be blended several times.
-        colors: Any number of channels per Gaussian; None for depth and alpha alone.
-        background: Colour behind everything; black if None.
-        depth: Whether to blend expected depth too.
+        colors: Any number of channels per Gaussian; None for depth and alpha only.
+        background: Colour behind the Gaussians; black if None.
+        depth: Whether to render expected depth too.
 
     Raises:
-        ValueError: Shapes, devices or number types do not fit.
+        ValueError: Shapes, devices or dtypes do not match.
     """
     means2d = projection.means2d
     if colors is None:
@@ -134,27 +134,27 @@ def blend(
 def blend_sample(
     projection: Projection, colors: Float[Tensor, "N C"], *, tiles: int, every: int
 ) -> tuple[Rendering, tuple[Int[Tensor, " P"], Int[Tensor, " P"]]]:
-    """Blends pixels spread over a picture, enough for statistics of it, without gradient and without background.
+    """Renders a sample of pixels spread over the image, for statistics; without gradient and background.
 
-    Only the tiles in which they lie are blended. Torch's random state draws which.
+    Only randomly chosen tiles are blended (torch's global random state).
 
     Args:
         projection: From `project`.
         colors: Any number of channels per Gaussian.
-        tiles: About how many tiles.
-        every: One of so many rows and columns of a tile.
+        tiles: Approximate number of tiles.
+        every: Stride of the sampled rows and columns within a tile.
 
     Returns:
         The rendering of P pixels, and their rows and columns.
 
     Raises:
-        ValueError: Shapes, devices or number types do not fit.
+        ValueError: Shapes, devices or dtypes do not match.
     """
     means2d, camera = projection.means2d, projection.camera
     _check("colors", colors, (len(means2d), None), means2d, projection.backend)
     lines, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     step = max(1, lines * columns // tiles)
-    # Diagonals of tiles, which no row or column of the picture escapes.
+    # Diagonals of tiles, so that every row and column of tiles is sampled.
     diagonal = np.add.outer(np.arange(lines), np.arange(columns)) + int(float(torch.rand(())) * step)
     chosen = diagonal % step == 0
     corners = TILE * np.argwhere(chosen)[:, None]
@@ -177,18 +177,19 @@ def sh_to_colors(
     visible: Bool[Tensor, "N"] | None = None,
     clamped: bool = True,
 ) -> Float[Tensor, "N 3"]:
-    """Colours of Gaussians as a camera sees them: max(0, spherical harmonics + 0.5), as in 3DGS and gsplat.
+    """View-dependent colours of Gaussians: max(0, spherical harmonics + 0.5), as in 3DGS and gsplat.
 
     Args:
-        means: Centres, world units; the direction is from the camera's centre to them. Differentiable.
-        sh: Coefficients, at least (degree + 1)^2 per channel; further ones are not used. Differentiable.
+        means: Centres, world units; the viewing direction is from the camera's centre to them. Differentiable.
+        sh: Coefficients, at least (degree + 1)^2 per channel; further ones are ignored. Differentiable.
         camera: The camera.
         degree: 0 to 3.
-        visible: Others get colour 0 and no gradient (`Projection.visible`); None computes all.
-        clamped: Whether colours below black become black; False leaves out the max(0, …).
+        visible: Mask of the Gaussians to compute (`Projection.visible`); others get colour 0 and no gradient. None
+            computes all.
+        clamped: Whether to clamp negative colours to 0.
 
     Raises:
-        ValueError: Shapes or number types do not fit, or the degree is not supported.
+        ValueError: Shapes or dtypes do not match, or the degree is not supported.
     """
     backend = pick_backend(means.device)
     bases = num_sh_bases(degree)
@@ -220,7 +221,7 @@ def rasterize(
 ) -> Rendering:
     """Renders Gaussians in one call: `project`, `sh_to_colors` if `sh_degree` is given, `blend`.
 
-    `colors` are values per Gaussian, or spherical harmonics to evaluate at `sh_degree`. The other arguments and the
+    `colors` are per-Gaussian values, or spherical harmonics if `sh_degree` is given. The other arguments and the
     errors are those of `project` and `blend`.
     """
     projection = project(means, quats, scales, opacities, camera, backend=backend, near=near, eps2d=eps2d)

@@ -1,4 +1,4 @@
-"""Loads gsplat for the CUDA backend, and says what to do where it cannot work."""
+"""Loads gsplat for the CUDA backend, with instructions in errors if it is missing or incompatible."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ _CALLS = {
     ),
     "spherical_harmonics": (("degrees_to_use", "dirs", "coeffs"), ("masks",)),
 }
-"""Functions of gsplat that the backend calls: their first parameters in order, and keywords."""
+"""Functions of gsplat that the backend calls: their leading positional parameters, and keywords."""
 
 
 @cache
 def load_gsplat() -> Any:
-    """The module gsplat, with its CUDA extension built and loaded.
+    """Returns the module gsplat with its CUDA extension built and loaded.
 
     The first call on a machine builds the extension, which takes minutes (docs/nvidia.md).
 
@@ -58,10 +58,10 @@ def load_gsplat() -> Any:
 
 
 def import_gsplat() -> ModuleType:
-    """The Python part of gsplat; needs neither a GPU nor nvcc.
+    """Imports the Python part of gsplat, which needs neither a GPU nor nvcc.
 
     Raises:
-        UserError: gsplat is missing, or has another version or other signatures than the backend was written for.
+        UserError: gsplat is missing, or its version or signatures are incompatible with the backend.
     """
     try:
         import gsplat
@@ -78,7 +78,7 @@ def _installed_version() -> str | None:
     try:
         return importlib.metadata.version("gsplat")
     except importlib.metadata.PackageNotFoundError:
-        return None  # a source tree on the path; its signatures are checked all the same
+        return None  # gsplat from a source tree on the path; its signatures are checked nevertheless
 
 
 def check_interface(module: Any, version: str | None) -> None:
@@ -86,10 +86,10 @@ def check_interface(module: Any, version: str | None) -> None:
 
     Args:
         module: gsplat.
-        version: As installed; None where it is not known.
+        version: The installed version; None if unknown.
 
     Raises:
-        UserError: They do not fit.
+        UserError: They are incompatible.
     """
     numbers = tuple(int(part) for part in re.findall(r"\d+", version or "")[:3])
     supported = not numbers or _FIRST <= numbers < _BEFORE
@@ -110,10 +110,10 @@ def _fits(function: Any, positional: tuple[str, ...], keywords: tuple[str, ...])
 
 
 def require_extension() -> None:
-    """Loads gsplat's CUDA extension and builds it where that has not been done yet.
+    """Loads gsplat's CUDA extension; builds it if necessary.
 
     Raises:
-        UserError: There is no nvcc, or the build failed.
+        UserError: nvcc is missing, or the build failed.
     """
     try:
         with _interrupted_builds_continue():
@@ -122,12 +122,14 @@ def require_extension() -> None:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise UserError(f"gsplat's CUDA extension could not be built ({reason}): {build_help()}") from error
     if extension is None:
-        raise UserError(f"gsplat has no CUDA extension here, because it found no nvcc: {build_help()}")
+        raise UserError(
+            f"gsplat could not build its CUDA extension, because it found no nvcc: {build_help()}"
+        )
 
 
 @contextmanager
 def _interrupted_builds_continue() -> Iterator[None]:
-    """Keeps what an interrupted build has compiled, which gsplat would delete before it builds."""
+    """Prevents gsplat from deleting the object files of an interrupted build."""
     remove = shutil.rmtree
 
     def keep(path: Any, *arguments: Any, **keywords: Any) -> None:
@@ -142,7 +144,7 @@ def _interrupted_builds_continue() -> Iterator[None]:
 
 
 def build_help() -> str:
-    """What building gsplat's extension needs, for error messages and `wildgs doctor`."""
+    """Requirements of building gsplat's extension, for error messages and `wildgs doctor`."""
     wanted = torch.version.cuda or "the CUDA version of your torch"
     return (
         f"install nvcc {wanted} (the version of your torch), a C++ compiler and ninja, and set CUDA_HOME "
@@ -153,7 +155,7 @@ def build_help() -> str:
 
 
 def is_built() -> bool:
-    """Whether gsplat's CUDA extension was installed with it, or built before by the installed torch."""
+    """Whether gsplat's CUDA extension is installed, or already built with the installed torch."""
     if importlib.util.find_spec("gsplat.csrc") is not None:
         return True
     from torch.utils.cpp_extension import get_default_build_root
@@ -165,19 +167,19 @@ def is_built() -> bool:
 
 
 def toolkit_problem() -> str | None:
-    """Why gsplat's CUDA extension cannot be built here; None where the compiler fits torch."""
+    """Why gsplat's CUDA extension cannot be built; None if the compiler is compatible with torch."""
     wanted, found = torch.version.cuda, find_nvcc()
     if wanted is None:
-        return "this build of torch has no CUDA"
+        return "this build of torch does not support CUDA"
     if found is None:
         return f"nvcc is not installed; torch was built with CUDA {wanted}"
     if found[1].split(".")[0] != wanted.split(".")[0]:
-        return f"{found[0]} is of CUDA {found[1]}, and torch was built with CUDA {wanted}"
+        return f"{found[0]} belongs to CUDA {found[1]}, but torch was built with CUDA {wanted}"
     return None
 
 
 def find_nvcc() -> tuple[Path, str] | None:
-    """The CUDA compiler that torch's builds would call, and its version ("13.0"); None where there is none."""
+    """The CUDA compiler that torch's builds call, and its version ("13.0"); None if there is none."""
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     candidates = [Path(home) / "bin" / "nvcc"] if home else []
     on_path = shutil.which("nvcc")

@@ -1,7 +1,7 @@
-"""What every rasteriser backend takes and gives.
+"""Inputs and outputs of the rasteriser backends.
 
-Rasterisation is split in two, so that geometry work is done once and blended several times:
-`project` (projection, tile binning, depth order) and `blend` (front-to-back compositing of any channels).
+Rasterisation is split in two, so that one projection can be blended several times: `project` (projection, tile
+binning, depth sorting) and `blend` (front-to-back alpha blending of any channels).
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from wildgs.geometry.camera import Camera
 
 BackendName = Literal["cpu", "cuda", "reference"]
 
-TILE = 16  # pixels along a tile's side
-EPS2D = 0.3  # px^2 added to the 2D covariance's diagonal, gsplat's default: nothing is thinner than a pixel
-MIN_ALPHA = 1.0 / 255.0  # a Gaussian is dropped at a pixel where its alpha is below
+TILE = 16  # side of a tile in pixels
+EPS2D = (
+    0.3  # px^2 added to the diagonal of 2D covariances, gsplat's default: a low-pass filter of about a pixel
+)
+MIN_ALPHA = 1.0 / 255.0  # Gaussians with a lower alpha at a pixel are skipped there
 MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave no more light than this ends the pixel and is dropped
+MIN_TRANSMITTANCE = 1e-4  # blending of a pixel stops before the Gaussian that would leave no more than this
 
 
 @dataclass
 class Projection:
-    """Gaussians as one camera sees them, with the backend's tile lists.
+    """Gaussians projected into a camera, with the backend's tile lists.
 
     Attributes:
         camera: The camera.
@@ -33,13 +35,13 @@ class Projection:
             the screen gradient after the backward pass (densification).
         depths: Camera-space z of the centres, world units. Differentiable.
         conics: Inverse of the dilated 2D covariances (xx, xy, yy), in 1/pixel^2. Differentiable.
-        opacities: As given. Differentiable.
-        radii: Reach in pixels, rounded up: where alpha falls to 1/255 along the wider image axis (gsplat 1.5's
-            opacity-aware radius, its larger one); 0 where the Gaussian is not seen (culled).
-        backend: Which backend made it, and must blend it.
-        tiles: The backend's own tile lists, opaque to callers.
-        absgrad: Where `blend`'s backward pass adds |d loss / d means2d| per pixel, summed (gsplat's `absgrad`);
-            None unless asked for.
+        opacities: As passed to `project`. Differentiable.
+        radii: Radii in pixels, rounded up, at which alpha falls to 1/255 along the wider image axis (the larger of
+            gsplat 1.5's opacity-aware radii); 0 for culled Gaussians.
+        backend: The backend that made the projection and must blend it.
+        tiles: The backend's tile lists, opaque to callers.
+        absgrad: Buffer to which `blend`'s backward pass adds the sum of |d loss / d means2d| over pixels (gsplat's
+            `absgrad`); None unless requested.
     """
 
     camera: Camera
@@ -54,18 +56,18 @@ class Projection:
 
     @property
     def visible(self) -> Bool[Tensor, "N"]:
-        """Which Gaussians reach the picture."""
+        """Mask of Gaussians that are not culled."""
         return self.radii > 0
 
 
 @dataclass
 class Rendering:
-    """A blended picture, or some pixels of one.
+    """A rendered image, or some of its pixels.
 
     Attributes:
         colors: Σ c_i α'_i T_i (+ background · (1 - alpha)).
         depth: Expected depth Σ d_i α'_i T_i / alpha in world units (gsplat's "ED"); 0 where alpha is 0, and
-            everywhere if `blend` was told to leave depth out.
+            everywhere if `blend` was called with ``depth=False``.
         alpha: Σ α'_i T_i in [0, 1].
     """
 
@@ -74,5 +76,5 @@ class Rendering:
     alpha: Float[Tensor, "*pixels"]
 
     def detached(self) -> Rendering:
-        """The same picture without its autograd graph."""
+        """The rendering, detached from the autograd graph."""
         return Rendering(self.colors.detach(), self.depth.detach(), self.alpha.detach())

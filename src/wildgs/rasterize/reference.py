@@ -1,6 +1,6 @@
-"""The rasteriser spelt out in dense torch: slow, differentiable in every step, in float32 or float64.
+"""Reference rasteriser in dense PyTorch: slow, differentiable by autograd, in float32 or float64.
 
-Other backends are held to this one. Semantics are gsplat's classic mode (version 1.5): see `interface`.
+The other backends are tested against it. Semantics are gsplat's classic mode (version 1.5), see `interface`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from wildgs.rasterize.interface import (
     Rendering,
 )
 
-_ELEMENTS = 1 << 22  # (Gaussian, pixel) pairs held at once
+_ELEMENTS = 1 << 22  # (Gaussian, pixel) pairs in memory at once
 
 
 def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int, height: int) -> Tensor:
-    """Of the perspective projection, held constant beyond 0.15 picture widths outside the picture."""
+    """Jacobian of the perspective projection; points are clamped to the image plus a margin of 15% of its size."""
     x, y, z = points.unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
@@ -38,8 +38,8 @@ def _jacobian(points: Float[Tensor, "N 3"], K: Float[Tensor, "3 3"], width: int,
     )
 
 
-def _sound(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
-    """Gaussians that are finite and not transparent; others would spread NaN through the gradients."""
+def _valid(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> Tensor:
+    """Mask of Gaussians that are finite and not transparent; others would propagate NaN to the gradients."""
     finite = means.isfinite().all(-1) & quats.isfinite().all(-1) & scales.isfinite().all(-1)
     return finite & opacities.isfinite() & (opacities >= MIN_ALPHA)
 
@@ -58,7 +58,7 @@ def project(
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     with torch.no_grad():
         points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-        chosen = (_sound(means, quats, scales, opacities) & (points[:, 2] > near)).nonzero()[:, 0]
+        chosen = (_valid(means, quats, scales, opacities) & (points[:, 2] > near)).nonzero()[:, 0]
     points = means[chosen] @ viewmat[:3, :3].T + viewmat[:3, 3]
     spread = viewmat[:3, :3] @ quats_to_rotations(quats[chosen]) * scales[chosen, None, :]
     footprint = _jacobian(points, K, camera.width, camera.height) @ spread
@@ -123,14 +123,14 @@ def blend(
 def blend_tiles(
     projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
 ) -> Rendering:
-    """Blends all tiles, the chosen among them."""
+    """Blends all tiles, which include the chosen ones."""
     return blend(projection, colors, None, True)
 
 
 def _blend_pixels(
     projection: Projection, order: Tensor, values: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Weighted sums of the values at some pixels, and the accumulated alpha."""
+    """Alpha-weighted sums of the values at some pixels, and the accumulated alpha."""
     centres = projection.means2d[order, None].expand(-1, len(pixels), -1)
     if projection.absgrad is not None and centres.requires_grad:
         total = projection.absgrad
@@ -145,7 +145,7 @@ def _blend_pixels(
     alpha = (projection.opacities[order, None] * falloff).clamp(max=MAX_ALPHA)
     alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0)
     after = torch.cumprod(1 - alpha, dim=0)
-    # Once a Gaussian would leave too little light, it and all behind it are dropped.
+    # The first Gaussian that would leave too little transmittance and all Gaussians behind it are skipped.
     alpha = torch.where(after > MIN_TRANSMITTANCE, alpha, 0)
     after = torch.cumprod(1 - alpha, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(order) else after

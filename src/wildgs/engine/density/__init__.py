@@ -1,4 +1,4 @@
-"""Density control: which Gaussians are added and taken away in training; a file for each strategy."""
+"""Adaptive density control: strategies to add and remove Gaussians during training, one module each."""
 
 from wildgs.engine.density.classic import AbsGradDensity, ClassicDensity
 from wildgs.engine.density.control import DensityControl, DensityReport, SeenView, ViewStatistics
@@ -9,7 +9,7 @@ STRATEGIES: dict[str, type[DensityControl]] = {
     "absgrad": AbsGradDensity,
     "relocation": RelocationDensity,
 }
-"""By the names of `DensityConfig.strategy`."""
+"""Strategies by the names of `DensityConfig.strategy`."""
 
 __all__ = [
     "STRATEGIES",

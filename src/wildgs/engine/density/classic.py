@@ -20,11 +20,11 @@ class ClassicDensity(DensityControl):
     """Clones small and splits large Gaussians where the mean screen gradient of their centres is large."""
 
     grow_factor: float = 1.0
-    """On `DensityConfig.grow_gradient`."""
+    """Factor on `DensityConfig.grow_gradient`."""
 
     @torch.no_grad()
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
-        """Screen gradients, per half picture, and reaches as a share of the picture's longer side."""
+        """Screen gradients in units of half the image size, and radii relative to the longer side of the image."""
         projection = view.projection
         gradient = projection.absgrad if self.absgrad else projection.means2d.grad
         if gradient is None:
@@ -51,7 +51,7 @@ class ClassicDensity(DensityControl):
         growable: Bool[Tensor, "N"] | None = None,
         sort: bool = False,
     ) -> DensityReport:
-        """One round: clones and splits where the screen gradient is large, prunes the faint."""
+        """Clones and splits Gaussians with large screen gradients; prunes Gaussians of low opacity."""
         scales = gaussians.scales
         largest = scales.max(dim=-1).values
         grows = self._select_growing(growable)
@@ -77,7 +77,7 @@ class ClassicDensity(DensityControl):
         return DensityReport(cloned, split, pruned)
 
     def _select_large(self, gaussians: Gaussians, largest: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Gaussians that are too large in the scene or on some photo."""
+        """Mask of Gaussians that are too large in the world or in an image."""
         allowed = torch.full_like(largest, self.extent)
         if self.config.prune_by_distance:
             distance = (gaussians.means - gaussians.means.nanmedian(dim=0).values).norm(dim=-1)
@@ -102,7 +102,7 @@ class ClassicDensity(DensityControl):
     def _split(
         self, gaussians: Gaussians, which: Int[Tensor, " C"], generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Two smaller Gaussians drawn from each large one's own distribution."""
+        """Two smaller Gaussians for each one, with means sampled from its distribution."""
         rows = self._taken(gaussians, which, SPLIT_INTO)
         noise = upload(torch.randn(len(rows["means"]), 3, generator=generator), rows["means"].device)
         offsets = noise * rows["log_scales"].exp()
@@ -112,9 +112,9 @@ class ClassicDensity(DensityControl):
 
 
 class AbsGradDensity(ClassicDensity):
-    """Absolute gradients (Ye et al. 2024, AbsGS): those of a large Gaussian's pixels do not cancel.
+    """Uses absolute screen gradients (AbsGS, Ye et al. 2024), which do not cancel over the pixels of a Gaussian.
 
-    The threshold is four times 3DGS's, as gsplat recommends with them.
+    The threshold is four times that of 3DGS, as gsplat recommends for absolute gradients.
     """
 
     absgrad = True

@@ -1,4 +1,4 @@
-"""What every strategy of density control has: statistics of views, a budget, and edits of the Gaussians."""
+"""Base class of the strategies of density control: statistics of views, budget, and edits of the Gaussians."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from wildgs.rasterize import Projection
 
 @dataclass(frozen=True)
 class ViewStatistics:
-    """What views say about each Gaussian; N rows.
+    """Statistics of each Gaussian over views; N rows.
 
     Attributes:
-        demand: How much they ask for more Gaussians in its place, added up over the views; what is measured is the
-            strategy's.
-        seen: How many views see it.
-        largest: The largest of what the strategy measures beside that.
+        demand: Sum over views of a measure of how much more Gaussians are needed there; defined by the strategy.
+        seen: Number of views in which the Gaussian is visible.
+        largest: Maximum over views of a second measure, defined by the strategy.
     """
 
     demand: Float[Tensor, "N"]
@@ -34,7 +33,7 @@ class ViewStatistics:
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What one round did, in numbers of Gaussians."""
+    """Numbers of Gaussians that one round of densification edited."""
 
     cloned: int
     split: int
@@ -43,13 +42,13 @@ class DensityReport:
 
 @dataclass(frozen=True)
 class SeenView:
-    """A training step as density control sees it.
+    """Data of a training step for density control.
 
     Attributes:
-        projection: Of the Gaussians, after the backward pass.
+        projection: Projection of the Gaussians, after the backward pass.
         colors: The render.
         photo: RGB in [0, 1].
-        counts: Which pixels of the photo count: neither transient nor masked by the user; None for all.
+        counts: Mask of the photo's pixels that are neither transient nor masked by the user; None for all.
     """
 
     projection: Projection
@@ -59,31 +58,31 @@ class SeenView:
 
     @property
     def error(self) -> Float[Tensor, "H W"]:
-        """Absolute error of the render, mean over the channels; 0 where the photo does not count."""
+        """Absolute error of the render, mean over the channels; 0 at masked pixels."""
         error = (self.colors.detach() - self.photo).abs().mean(dim=-1)
         return error if self.counts is None else torch.where(self.counts, error, 0.0)
 
 
 class DensityControl(ABC):
-    """Gathers statistics of views and edits the Gaussians: `measure` and `densify` are the strategy's."""
+    """Gathers statistics of views and edits the Gaussians; strategies implement `measure` and `densify`."""
 
     resets: bool = True
-    """Whether opacity resets belong to the strategy."""
+    """Whether the strategy includes opacity resets."""
     until: float = 0.5
-    """Share of a run in which it edits."""
+    """Share of the training steps after which densification ends."""
     absgrad: bool = False
-    """Whether it reads `Projection.absgrad`."""
+    """Whether the strategy needs `Projection.absgrad`."""
 
     def __init__(
         self, config: DensityConfig, extent: float, num_gaussians: int, device: torch.device | str = "cpu"
     ) -> None:
-        """Sets up a `DensityControl`.
+        """Initialises empty statistics.
 
         Args:
             config: Thresholds.
             extent: Radius of the cameras' region, world units.
-            num_gaussians: N now.
-            device: Where the Gaussians are.
+            num_gaussians: Current number of Gaussians N.
+            device: Device of the Gaussians.
         """
         self.config = config
         self.extent = extent
@@ -96,25 +95,25 @@ class DensityControl(ABC):
         self.largest = torch.zeros(num_gaussians, device=self.device)
 
     def state(self) -> dict[str, Tensor]:
-        """What `restore` needs; names are those of checkpoints."""
+        """Statistics for `restore`; the names are part of the checkpoint format."""
         return {"gradient_sum": self.demand, "seen": self.seen, "reach": self.largest}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Continues where `state` was taken."""
+        """Restores statistics from `state`."""
         names = ("gradient_sum", "seen", "reach")
         self.demand, self.seen, self.largest = (state[name].to(self.device) for name in names)
 
     def measures(self, step: int) -> bool:
-        """Whether the strategy reads this step."""
+        """Whether the strategy gathers statistics in this step."""
         return True
 
     @abstractmethod
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
-        """What one view says.
+        """Computes the statistics of one view.
 
         Args:
-            view: After its backward pass.
-            sound: False where the step was skipped, so that all is zero; None stands for True.
+            view: The view, after its backward pass.
+            sound: False if the step was skipped (non-finite values): all statistics are zero then. None means True.
         """
 
     @abstractmethod
@@ -128,15 +127,15 @@ class DensityControl(ABC):
         growable: Bool[Tensor, "N"] | None = None,
         sort: bool = False,
     ) -> DensityReport:
-        """One round.
+        """Runs one round of densification and pruning.
 
         Args:
             gaussians: Edited in place.
-            optimizer: Edited alike.
-            generator: Draws positions.
-            prune_large: Whether oversized Gaussians go as well.
-            growable: Which Gaussians may be cloned, split and pruned; None for all.
-            sort: Whether to leave the Gaussians in Morton order.
+            optimizer: Its state is edited in the same way.
+            generator: Random numbers of new positions.
+            prune_large: Whether to prune oversized Gaussians too.
+            growable: Mask of the Gaussians that may be cloned, split and pruned; None for all.
+            sort: Whether to sort the Gaussians in Morton order.
         """
 
     @torch.no_grad()
@@ -146,13 +145,13 @@ class DensityControl(ABC):
         pool: Callable[[ViewStatistics], ViewStatistics] | None = None,
         sound: Bool[Tensor, ""] | None = None,
     ) -> None:
-        """Adds one view; call after the backward pass.
+        """Adds the statistics of one view; call after the backward pass.
 
         Args:
             view: The view.
-            pool: Makes one view's statistics those of several processes' views, at once: then what this holds
-                is the whole of it in any of them.
-            sound: False where the view is not to count, see `measure`.
+            pool: Combines the statistics of the views of several processes (all-reduce), so that all processes hold
+                the same totals.
+            sound: False if the view must be ignored, see `measure`.
         """
         statistics = self.measure(view, sound)
         if pool is not None:
@@ -163,7 +162,7 @@ class DensityControl(ABC):
 
     @torch.no_grad()
     def shrink(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, budget: int) -> int:
-        """Drops the least opaque Gaussians beyond a budget; how many it dropped."""
+        """Removes the least opaque Gaussians beyond a budget; returns how many were removed."""
         excess = len(gaussians) - budget
         if excess <= 0:
             return 0
@@ -181,12 +180,12 @@ class DensityControl(ABC):
         optimizer: torch.optim.Optimizer,
         growable: Bool[Tensor, "N"] | None = None,
     ) -> None:
-        """Lowers opacities to `reset_opacity` at most, so that useless Gaussians fade and are pruned.
+        """Clamps opacities to at most `reset_opacity`, so that useless Gaussians do not recover and are pruned.
 
         Args:
             gaussians: Edited in place.
-            optimizer: Whose moments of the opacities are cleared.
-            growable: Which Gaussians may be pruned, and so are reset; None for all.
+            optimizer: Its moments of the opacities are cleared.
+            growable: Mask of the Gaussians that may be pruned and are therefore reset; None for all.
         """
         logits = gaussians.rows["opacity_logits"]
         lowered = logits.clamp(max=float(torch.tensor(self.config.reset_opacity).logit()))
@@ -200,12 +199,12 @@ class DensityControl(ABC):
 
     @staticmethod
     def _broken(gaussians: Gaussians) -> Bool[Tensor, "N"]:
-        """Gaussians with a place or size that is not finite."""
+        """Mask of Gaussians with a non-finite position or scale."""
         return ~(gaussians.means.isfinite().all(dim=-1) & gaussians.scales.isfinite().all(dim=-1))
 
     @staticmethod
     def _taken(gaussians: Gaussians, which: Int[Tensor, " C"], times: int = 1) -> dict[str, Tensor]:
-        """Rows of some Gaussians, as often as asked for."""
+        """Copies the parameters of selected Gaussians, `times` times."""
         return {
             name: rows.detach()[which].repeat(times, *[1] * (rows.dim() - 1))
             for name, rows in gaussians.rows.items()

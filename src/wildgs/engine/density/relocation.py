@@ -1,10 +1,11 @@
-"""Growth and relocation by error: Gaussians move from where they show nothing to where renders are wrong.
+"""Error-based densification and relocation: splits Gaussians with high error, prunes those that contribute nothing.
 
-3DGS clones and splits by screen gradients, which are small where a render is only blurred, and once a budget is
-spent it changes nothing any more. Here some views between two rounds say how much of their error each Gaussian
-covers (scores of Taming 3DGS, Mallick et al. 2024, and FastGS, Ren et al. 2025, are of this kind), and how many
-pixels it shows. A round splits what covers most error and takes away what shows nothing, so that a full budget goes
-on moving, as in 3DGS as Markov chain Monte Carlo (Kheradmand et al. 2024).
+3DGS clones and splits by screen gradients, which are small where a render is merely blurred; and when its budget is
+exhausted, it changes nothing any more. This strategy measures in some of the training views how much of the image
+error falls on each Gaussian (similar to the scores of Taming 3DGS, Mallick et al. 2024, and FastGS, Ren et al.
+2025), and to how many pixels it contributes. Each round splits the Gaussians with the most error and removes those
+without contribution, so that Gaussians are relocated even when the budget is exhausted, as in 3DGS-MCMC (Kheradmand
+et al. 2024).
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Projection, blend
 
 MEASURE_EVERY = 7
-"""Steps; each of those costs one more blend of two channels."""
+"""Interval of measured steps; a measurement costs an additional blend of two channels."""
 LEAST_VIEWS = 2
-"""Before a Gaussian that shows nothing may go."""
+"""Minimum number of measured views before a Gaussian without contribution is pruned."""
 MEMORY = 0.8
-"""Of what a Gaussian shows at most, from one round to the next."""
+"""Decay per round of the maximum contribution of a Gaussian."""
 HALF_SHIFT, HALF_LENGTH, HALF_WIDTH = 0.6, 0.65, 0.9
-"""Of the two halves of a Gaussian, in its own standard deviations: their distance from its centre and their length
-along its longest axis, and their width across it. Along the axis they have its spread together."""
+"""The two halves of a split Gaussian, relative to its scales: distance from its centre along the longest axis,
+scale along that axis, and scale across it. Together they have about the variance of the original along the axis."""
 
 
 class RelocationDensity(DensityControl):
-    """Splits what covers most error, and takes away what shows nothing."""
+    """Splits the Gaussians with the most error, and prunes those that contribute nothing."""
 
     resets = False
     until = 0.8
@@ -50,11 +51,11 @@ class RelocationDensity(DensityControl):
         self.known = state["known"].to(self.device) - self.seen
 
     def measures(self, step: int) -> bool:
-        """Every seventh step."""
+        """Whether this is one of every `MEASURE_EVERY` steps."""
         return step % MEASURE_EVERY == 0
 
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
-        """Error that each Gaussian covers, in pixels times error, and how many pixels it shows."""
+        """Blending-weighted sums over pixels for each Gaussian: image error, and 1."""
         values = view.projection.means2d.new_ones(len(view.projection.means2d), 2, requires_grad=True)
         with torch.enable_grad():
             shown = blend(_detached(view.projection), values, depth=False).colors
@@ -79,44 +80,45 @@ class RelocationDensity(DensityControl):
         growable: Bool[Tensor, "N"] | None = None,
         sort: bool = False,
     ) -> DensityReport:
-        """One round; its size is bounded by the number of Gaussians, the error that is left, and the budget."""
+        """Splits and prunes; the counts are limited by `grow_share`, the error threshold, and the budget."""
         count = len(gaussians)
         fixed = torch.zeros_like(gaussians.opacities, dtype=torch.bool) if growable is None else ~growable
         most = max(1, round(self.config.grow_share * count))
-        gone = self._select_useless(gaussians, fixed, most)
-        room = self.config.max_gaussians - count + int(gone.sum())
-        split = self._select_wrong(fixed | gone, min(most, room))
-        keep = ~gone
+        prune = self._select_useless(gaussians, fixed, most)
+        pruned = int(prune.sum())
+        room = self.config.max_gaussians - count + pruned
+        split = self._select_high_error(fixed | prune, min(most, room))
+        keep = ~prune
         keep[split] = False
-        if not (len(split) or int(gone.sum())) or not (len(split) or int(keep.sum())):
+        if not (len(split) or pruned) or not (len(split) or int(keep.sum())):
             return DensityReport(0, 0, 0)
         source = edit_rows(gaussians, optimizer, keep, self._halves(gaussians, split), sort=sort)
-        self._remember(source)
-        return DensityReport(0, len(split), int(gone.sum()))
+        self._carry_over(source)
+        return DensityReport(0, len(split), pruned)
 
     def _select_useless(self, gaussians: Gaussians, fixed: Tensor, most: int) -> Bool[Tensor, "N"]:
-        """Faint ones, broken ones, and of those that show next to nothing the `most` that show least."""
-        gone = (gaussians.opacities < self.config.prune_opacity) & ~fixed
-        gone = gone | self._broken(gaussians)
+        """Transparent and non-finite Gaussians, and at most `most` of those with the least contribution."""
+        prune = (gaussians.opacities < self.config.prune_opacity) & ~fixed
+        prune = prune | self._broken(gaussians)
         hidden = (
             (self.known + self.seen >= LEAST_VIEWS)
             & (self.largest < self.config.least_pixels)
             & ~fixed
-            & ~gone
+            & ~prune
         )
         least = torch.where(hidden, self.largest, torch.inf).argsort()[: min(most, int(hidden.sum()))]
-        gone[least] = True
-        return gone
+        prune[least] = True
+        return prune
 
-    def _select_wrong(self, excluded: Bool[Tensor, "N"], most: int) -> Int[Tensor, " S"]:
-        """Those that cover most error, and enough of it in the views that see them."""
+    def _select_high_error(self, excluded: Bool[Tensor, "N"], most: int) -> Int[Tensor, " S"]:
+        """Gaussians with the largest total error, if their mean error per view exceeds `grow_error`."""
         enough = self.demand > self.config.grow_error * self.seen.clamp_min(1)
         demand = torch.where(enough & ~excluded, self.demand, 0.0)
         chosen = demand.topk(min(max(most, 0), len(demand))).indices
         return chosen[demand[chosen] > 0]
 
     def _halves(self, gaussians: Gaussians, which: Int[Tensor, " S"]) -> dict[str, Float[Tensor, "T *rest"]]:
-        """Two Gaussians in the place of each, side by side along its longest axis."""
+        """Two Gaussians that replace each one, side by side along its longest axis."""
         rows = self._taken(gaussians, which, 2)
         length, axis = rows["log_scales"].exp().max(dim=1)
         every = torch.arange(len(axis), device=axis.device)
@@ -128,8 +130,8 @@ class RelocationDensity(DensityControl):
         rows["log_scales"] = rows["log_scales"] + factors.log()
         return rows
 
-    def _remember(self, source: Int[Tensor, " M"]) -> None:
-        """Carries what Gaussians showed over to their new places; of new ones nothing is known."""
+    def _carry_over(self, source: Int[Tensor, " M"]) -> None:
+        """Carries statistics over to the edited rows; new Gaussians start without any."""
         known, largest = (
             torch.where(source >= 0, value[source.clamp_min(0)], 0.0)
             for value in (self.known + self.seen, MEMORY * self.largest)
@@ -139,6 +141,6 @@ class RelocationDensity(DensityControl):
 
 
 def _detached(projection: Projection) -> Projection:
-    """The same projection, to which no gradient flows."""
+    """The projection, detached from the autograd graph."""
     names = ("means2d", "depths", "conics", "opacities")
     return replace(projection, **{name: getattr(projection, name).detach() for name in names}, absgrad=None)

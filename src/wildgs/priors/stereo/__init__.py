@@ -1,7 +1,7 @@
-"""Depth without a network: multi-view stereo by PatchMatch with NCC windows.
+"""Depth without a network: PatchMatch multi-view stereo with normalised cross-correlation (NCC).
 
 After Galliani et al. ("Massively Parallel Multiview Stereopsis by Surface Normal Diffusion", ICCV 2015) and
-Schönberger et al. ("Pixelwise View Selection for Unstructured Multi-View Stereo", ECCV 2016). Normalised
-cross-correlation does not notice affine changes of brightness, which is most of what differs between the lights of
-two photos. What three photos agree on is kept; sky and passers-by, on which they do not, have no estimate.
+Schönberger et al. ("Pixelwise View Selection for Unstructured Multi-View Stereo", ECCV 2016). NCC is invariant to
+affine changes of brightness, which covers most of the difference in lighting between two photos. Depth is kept
+where three photos agree; the sky and passers-by, where they do not, get no estimate.
 """

@@ -1,6 +1,6 @@
-"""Numba (njit) kernels of multi-view stereo: what photos tell each other of their planes.
+"""Numba (njit) kernels of multi-view stereo: exchange of planes between photos, and consistency checks.
 
-Planes, motions and layouts are those of `cost_kernels`.
+Planes, motions and layouts are defined in `cost_kernels`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from wildgs.threads import fetch_add
 
 @njit(nogil=True, error_model="numpy")
 def carry_planes(planes, costs, motion, back, hints, hint_costs):
-    """Carries a neighbour's planes to a photo: where several arrive, that of the least cost stays.
+    """Transfers a neighbour's planes to a photo; of several planes for one pixel, that of the lowest cost is kept.
 
     A plane q(x) = p . x of one camera is M^-T p / (1 + v . M^-T p) in the other, and M^-T is the transpose of the
     motion `back`.
@@ -66,12 +66,12 @@ def count_agreeing(
     inverse,
     agreeing,
 ):
-    """How many neighbours have the surface where a photo has it.
+    """Counts the neighbours whose depth is consistent with that of a photo, per pixel.
 
-    `planes` [P, 3] and `costs` [P] are those of all photos, laid out as pixels are. The point that a pixel shows
-    is found in the neighbour, the neighbour's own estimate there is carried back (`returns`): it has to arrive
-    within `reach` pixels and to differ by `tolerance` of the depth at most. `inverse` takes the mean inverse depth
-    of the photo and those that agree.
+    `planes` [P, 3] and `costs` [P] contain all photos in the layout of the pixels. Each pixel is projected into the
+    neighbour, and the neighbour's estimate there is projected back (`returns`): it must land within `reach` pixels
+    and differ by at most `tolerance` of the depth. The mean inverse depth of the photo and the consistent
+    neighbours is written to `inverse`.
     """
     offset, width, height = layout[photo]
     while True:
@@ -107,7 +107,7 @@ def count_agreeing(
                 w = r[6] * u + r[7] * v + r[8] + r[11] * p
                 if w <= 1e-6:
                     continue
-                back = p / w  # the inverse depth at which this camera sees the neighbour's point
+                back = p / w  # inverse depth of the neighbour's point in this camera
                 du = (r[0] * u + r[1] * v + r[2] + r[9] * p) / w - cx
                 dv = (r[3] * u + r[4] * v + r[5] + r[10] * p) / w - cy
                 if du * du + dv * dv < reach * reach and abs(back - q) < tolerance * q:
@@ -118,7 +118,7 @@ def count_agreeing(
 
 @njit(nogil=True, error_model="numpy")
 def drop_specks(counter, planes, kept, tolerance, least, result):
-    """Keeps pixels whose plane holds for `least` kept pixels of the 7 x 7 around them, within `tolerance`."""
+    """Removes speckles: keeps a pixel if its plane fits at least `least` kept pixels of its 7 x 7 window."""
     height, width = kept.shape
     while True:
         y = fetch_add(counter, 1)
@@ -134,4 +134,4 @@ def drop_specks(counter, planes, kept, tolerance, least, result):
                     q, _, _ = carried_plane(planes, j, i, y, x)
                     if kept[j, i] and abs(planes[j, i, 0] - q) < tolerance * q:
                         fitting += 1
-            result[y, x] = fitting > least  # it holds for itself
+            result[y, x] = fitting > least  # the pixel itself is counted too

@@ -1,14 +1,15 @@
-"""Numba (njit) kernels of PatchMatch stereo: what it costs to compare a slanted plane by NCC windows.
+"""Numba (njit) kernels of PatchMatch stereo: the matching cost of slanted planes by NCC windows.
 
-A plane is the inverse depth of a pixel with its change per pixel along x and y (q, q_x, q_y): inverse depth is
-affine over the picture of a plane. With M = K' R K^-1 and v = K' t, pixel x shows a point that another camera
-sees at M x + v q(x), so one plane carries a whole window without a matrix being made for it.
+A plane is the inverse depth of a pixel and its derivatives along x and y (q, q_x, q_y): the inverse depth of a
+plane is affine in pixel coordinates. With M = K' R K^-1 and v = K' t, the point at pixel x projects to M x + v q(x)
+in another camera, so a window is warped without computing a homography per plane.
 
-Pictures of all photos lie in flat arrays: `pixels`, and `blocks` of four pixels (see `pack_blocks`); a row of
-`layout` is (offset, width, height). The loops over a window have no branch, so that LLVM vectorises them.
+The images of all photos are stored in flat arrays: `pixels`, and `blocks` of four pixels (see `pack_blocks`); a row
+of `layout` is (offset, width, height). The loops over a window have no branch, so that LLVM vectorises them.
 
-`compared` is a tuple: pixels, blocks, layout, the photo's row, rows of its neighbours, their motions (M, rows
-first, and v: 12 numbers), planes known of all photos (or none) with their layout, and how many neighbours count.
+`compared` is a tuple: pixels, blocks, layout, the photo's row, rows of its neighbours, their motions (12 numbers: M
+in row-major order, then v), coarser planes of all photos (or none) and their layout, and the number of best
+neighbours that are averaged.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ import numpy as np
 from wildgs.kernel_cache import njit
 
 SAMPLES = 32
-"""Pixels of a window: every second of 11 x 11, without the corners."""
+"""Pixels of a window: every second row and column of 11 x 11, without the corners."""
 RADIUS = 5
 WORST = np.float32(2.0)
 BLANK = np.float32(4e-5)
-"""Variance of brightness (0 to 1) below which a window has nothing to compare: a deviation of 1.6 of 255."""
+"""Windows of lower variance (of brightness in [0, 1]) are textureless: a standard deviation of 1.6 of 255."""
 _MATHS = {"reassoc", "contract", "arcp", "nsz", "afn"}
 _RANGE_SIGMA, _SPACE_SIGMA = np.float32(0.08), np.float32(6.0)
 _DISAGREEMENT, _TRUNCATED = np.float32(0.3), np.float32(0.04)
-"""Cost of planes of two photos that differ by this share of the depth, or more."""
+"""Cost of inconsistent planes of two photos, and the relative depth difference at which it is reached."""
 _SCALE = np.float32(65535.0)
 _LOW, _16, _32, _48 = np.uint64(0xFFFF), np.uint64(16), np.uint64(32), np.uint64(48)
 
 
 def window_offsets() -> np.ndarray:
-    """X and y of a window's pixels from its centre, [2, SAMPLES]."""
+    """Offsets (x, y) of a window's pixels from its centre, [2, SAMPLES]."""
     steps = np.arange(-RADIUS, RADIUS + 1, 2)
     x, y = np.meshgrid(steps, steps)
     inner = np.abs(x) + np.abs(y) < 2 * RADIUS
@@ -40,9 +41,9 @@ def window_offsets() -> np.ndarray:
 
 
 def pack_blocks(picture: np.ndarray) -> np.ndarray:
-    """For every pixel, its brightness and those to the right, below and diagonally below, 16 bits each.
+    """Packs each pixel with its right, lower and lower right neighbours into 64 bits, 16 bits each.
 
-    Reading between pixels then takes one gather, not four, and gathers are most of the cost.
+    Bilinear interpolation then needs one gather instead of four; gathers dominate the running time.
     """
     values = np.pad(np.round(picture.clip(0, 1) * 65535).astype(np.uint64), ((0, 1), (0, 1)), mode="edge")
     packed = values[:-1, :-1] | (values[:-1, 1:] << _16) | (values[1:, :-1] << _32) | (values[1:, 1:] << _48)
@@ -51,7 +52,7 @@ def pack_blocks(picture: np.ndarray) -> np.ndarray:
 
 @njit(nogil=True, fastmath=_MATHS, error_model="numpy")
 def read_window(pixels, place, x, y, window):
-    """A window's brightness less its mean, times bilateral weights, into `values`; its weighted variance."""
+    """Writes a window's zero-mean brightness times bilateral weights to `values`; returns its weighted variance."""
     offset, width, height = place
     offsets, values, weights = window
     centre = pixels[np.uint64(offset + y * width + x)]
@@ -86,7 +87,7 @@ def _correlation_cost(
     height,
     motions,
     s,
-    known,
+    coarse,
     start,
     across,
     down,
@@ -100,11 +101,11 @@ def _correlation_cost(
     weights,
     variance,
 ):
-    """1 - NCC of a window with what another photo shows of it if it lies on a plane; `WORST` outside that photo.
+    """1 - NCC of a window and its warp by a plane into another photo; `WORST` outside that photo.
 
-    The photo lies at `offset` of `blocks`, and its motion is row `s` of `motions`. Where its own planes are `known`
-    (`across` x `down` of them from `start`), the difference from them is added. Arrays come one by one: to unpack
-    them here, or to take a row of one, counts references, which costs as much as the comparison.
+    The other photo starts at `offset` of `blocks`; its motion is row `s` of `motions`. If its `coarse` planes are
+    given (`across` x `down` of them from `start`), a penalty for the difference from them is added. Arrays are
+    passed separately: unpacking a tuple or slicing here counts references, which costs as much as the comparison.
     """
     cx, cy = np.float32(x) + np.float32(0.5), np.float32(y) + np.float32(0.5)
     x0 = motions[s, 0] * cx + motions[s, 1] * cy + motions[s, 2] + motions[s, 9] * q
@@ -148,7 +149,7 @@ def _correlation_cost(
         square += weights[k] * value * value
         product += values[k] * value
     penalty = np.float32(0.0)
-    if known.size > 0:
+    if coarse.size > 0:
         column = u0 * (np.float32(across) / np.float32(width))
         line = v0 * (np.float32(down) / np.float32(height))
         left, above = min(np.int64(column), across - 1), min(np.int64(line), down - 1)
@@ -157,7 +158,7 @@ def _correlation_cost(
             column - np.float32(left) - np.float32(0.5),
             line - np.float32(above) - np.float32(0.5),
         )
-        there = known[at, 0] + known[at, 1] * right_of + known[at, 2] * below
+        there = coarse[at, 0] + coarse[at, 1] * right_of + coarse[at, 2] * below
         penalty = _DISAGREEMENT * min(np.float32(1.0), abs(there * z0 - q) / (_TRUNCATED * q))
     other = square - total * total
     if other < BLANK * _SCALE * _SCALE:
@@ -167,9 +168,9 @@ def _correlation_cost(
 
 @njit(nogil=True, fastmath=_MATHS, error_model="numpy")
 def plane_cost(compared, x, y, q, qx, qy, window, variance, costs):
-    """Mean cost of a plane over the `best` neighbours that fit it best: others have something in the way."""
+    """Mean cost of a plane over its `best` matching neighbours; in the others it may be occluded."""
     blocks, layout, neighbours, motions = compared[1], compared[2], compared[4], compared[5]
-    known, places, best = compared[6], compared[7], compared[8]
+    coarse, coarse_layout, best = compared[6], compared[7], compared[8]
     offsets, values, weights = window
     for s in range(neighbours.size):
         n = neighbours[s]
@@ -180,10 +181,10 @@ def plane_cost(compared, x, y, q, qx, qy, window, variance, costs):
             layout[n, 2],
             motions,
             s,
-            known,
-            places[n, 0],
-            places[n, 1],
-            places[n, 2],
+            coarse,
+            coarse_layout[n, 0],
+            coarse_layout[n, 1],
+            coarse_layout[n, 2],
             x,
             y,
             q,

@@ -1,4 +1,4 @@
-"""Depth of a scene's photos where several of them agree, and the files that keep it."""
+"""Multi-view stereo depth of a scene's photos, and its files."""
 
 from __future__ import annotations
 
@@ -31,16 +31,15 @@ from wildgs.threads import launch
 def stereo_depth(
     scene: Scene, config: StereoConfig, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Float32[np.ndarray, "H W"]]:
-    """Depth of the training photos; photos that test are not looked at.
+    """Estimates the depth of the training photos; test photos are not used.
 
     Args:
-        scene: With photos at the size at which they are compared.
-        config: How many neighbours, and what counts as agreement.
-        progress: Called with (photos done, photos in all).
+        scene: A scene with photos at matching resolution.
+        config: Number of neighbours and thresholds of consistency.
+        progress: Called with (photos done, total).
 
     Returns:
-        By photo, depth along the camera's axis in the scene's frame, at the view's size; 0 where photos do not
-        agree.
+        Photo name to depth along z in the scene's frame, at the view's resolution; 0 where photos do not agree.
     """
     views = scene.train_views
     neighbours = choose_neighbours(scene, config.neighbours)
@@ -88,7 +87,7 @@ def agreed_depth(
     found: Planes,
     config: StereoConfig,
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth of a photo where enough neighbours agree."""
+    """Depth of a photo where enough neighbours agree; 0 elsewhere."""
     _, width, height = level.layout[photo]
     if not others:
         return np.zeros((height, width), np.float32)
@@ -123,22 +122,22 @@ def fill_metric_folder(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[int, int]:
-    """Write the metric depth of the training photos of a scene, in units of its model (see `metric_file`).
+    """Writes the metric depth of a scene's training photos, in units of its model (see `metric_file`).
 
-    Photos that are held out are not looked at: what trains on the result knows nothing of them.
+    Held-out photos are not used, so that no test data leaks into training.
 
     Args:
         root: The scene's folder.
-        config: Of the search.
-        holdout: Which photos are held out where the scene has no split file, see `DataConfig`.
-        overwrite: Estimate again what is already there.
-        progress: Called with (photos done, photos in all).
+        config: Settings of stereo.
+        holdout: Which photos are held out if the scene has no split file, see `DataConfig`.
+        overwrite: Replace existing files.
+        progress: Called with (photos done, total).
 
     Returns:
-        How many were written, and how many were there before.
+        The number of files written, and the number that already existed.
 
     Raises:
-        UserError: There is no scene.
+        UserError: The folder contains no scene.
     """
     data = DataConfig(max_side=config.max_side, holdout=holdout, use_depth=False)
     scene = load_scene(root, data)
@@ -154,7 +153,7 @@ def fill_metric_folder(
     empty = [name for name in wanted if not depths[name].any()]
     if empty:
         warnings.warn(
-            f"{root}: other photos agree with {len(empty)} of {len(wanted)} photos nowhere, so they get no depth: "
+            f"{root}: {len(empty)} of {len(wanted)} photos get no depth, since no other photos agree with them: "
             f"{describe_names(empty)}",
             WildGSWarning,
             stacklevel=2,
@@ -162,8 +161,8 @@ def fill_metric_folder(
     cameras = {image.name: image.camera for image in model.images}
     for name in wanted:
         depth = depths[name] / np.float32(scene.alignment.scale)
-        place = PixelGrid.from_colmap(cameras[name], data.downscale, data.max_side).target()
-        _write_tiff(depth if place is None else sample_depth(depth, place), targets[name])
+        grid = PixelGrid.from_colmap(cameras[name], data.downscale, data.max_side).target()
+        _write_tiff(depth if grid is None else sample_depth(depth, grid), targets[name])
     return len(wanted), kept
 
 

@@ -1,4 +1,4 @@
-"""With which photos each is compared."""
+"""View selection for stereo: the neighbours against which each photo is matched."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _MOST_POINTS = 2000
 
 
 def choose_neighbours(scene: Scene, most: int) -> list[list[int]]:
-    """For every training photo, the training photos that see most of its points under good angles.
+    """Selects, for every training photo, the training photos with the most shared points at good angles.
 
-    Rays that meet at about ten degrees tell depth and still show the same picture.
+    Triangulation angles of about ten degrees determine depth well, while the photos still look alike.
 
     Args:
-        scene: With observations; without them, points count as seen by every photo in which they lie.
-        most: Neighbours at most.
+        scene: A scene with observations; without them, a photo observes all points that project into it.
+        most: Maximum number of neighbours.
     """
     views = scene.train_views
     seen = [seen_rows(scene, view) for view in views]
@@ -56,7 +56,7 @@ def choose_neighbours(scene: Scene, most: int) -> list[list[int]]:
 
 
 def seen_rows(scene: Scene, view: View) -> Int[np.ndarray, " K"]:
-    """Rows of the points that a photo triangulated; of all that lie in it where that is not known."""
+    """Rows of the points that a photo observes; without observations, of all points that project into it."""
     row = next(index for index, other in enumerate(scene.views) if other.name == view.name)
     observed = scene.observations[scene.observations[:, 0] == row, 1].unique().long()
     if len(observed) >= _LEAST_SHARED:

@@ -1,4 +1,4 @@
-"""What stereo works on: brightness and planes of all photos at one size, in flat arrays."""
+"""Data of stereo: brightness and planes of all photos at one resolution, in flat arrays."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _GREY = (0.299, 0.587, 0.114)
 
 @dataclass(frozen=True)
 class Planes:
-    """Planes of all photos and their costs, laid out as pixels are."""
+    """Planes of all photos and their costs, in the layout of the pixels."""
 
     planes: Float32[np.ndarray, "P 3"]
     costs: Float32[np.ndarray, " P"]
     layout: Int[np.ndarray, "V 3"]
 
     def of(self, photo: int) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
-        """Those of one photo, to be written to."""
+        """Writable views of the planes and costs of one photo."""
         start, width, height = self.layout[photo]
         own = slice(start, start + width * height)
         return self.planes[own].reshape(height, width, 3), self.costs[own].reshape(height, width)
@@ -34,7 +34,7 @@ class Planes:
 
 @dataclass(frozen=True)
 class Level:
-    """All photos at one size: brightness in one flat array, and where in it each is."""
+    """All photos at one resolution: brightness in one flat array, and the position of each photo in it."""
 
     cameras: list[Camera]
     pixels: Float32[np.ndarray, " P"]
@@ -43,7 +43,7 @@ class Level:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], pictures: Sequence[Float32[np.ndarray, "_ _"]]) -> Level:
-        """Photos of one channel, 0 to 1, by their cameras."""
+        """Packs single-channel photos in [0, 1] with their cameras."""
         sizes = np.array([picture.size for picture in pictures])
         starts = np.concatenate([[0], sizes.cumsum()[:-1]])
         layout = [(start, camera.width, camera.height) for start, camera in zip(starts, cameras, strict=True)]
@@ -53,13 +53,13 @@ class Level:
 
     @classmethod
     def of_views(cls, views: Sequence[View]) -> Level:
-        """Photos at the size of their views."""
+        """Packs the photos of views at their resolution."""
         weights = torch.tensor(_GREY)
         pictures = [(view.read_photo().float() / 255 @ weights).numpy() for view in views]
         return cls.of([view.camera for view in views], pictures)
 
     def halved(self) -> Level:
-        """The same photos at half the size."""
+        """The same photos at half the resolution."""
         cameras, pictures = [], []
         for camera, (start, width, height) in zip(self.cameras, self.layout, strict=True):
             size = (max(1, camera.height // 2), max(1, camera.width // 2))
@@ -69,21 +69,21 @@ class Level:
         return Level.of(cameras, pictures)
 
     def no_planes(self) -> Planes:
-        """Room for the planes of all photos."""
+        """Uninitialised planes of all photos, at the worst cost."""
         count = len(self.pixels)
         return Planes(np.zeros((count, 3), np.float32), np.full(count, WORST, np.float32), self.layout)
 
     def motions(self, photo: int, others: Sequence[int]) -> Float32[np.ndarray, "S 12"]:
-        """What carries pixels of a photo to others (see `cost_kernels`)."""
+        """Motions from a photo to others (see `cost_kernels`)."""
         return np.stack([_motion(self.cameras[photo], self.cameras[other]) for other in others])
 
     def returns(self, photo: int, others: Sequence[int]) -> Float32[np.ndarray, "S 12"]:
-        """What carries pixels of others to a photo."""
+        """Motions from others to a photo."""
         return np.stack([_motion(self.cameras[other], self.cameras[photo]) for other in others])
 
 
 def _motion(first: Camera, second: Camera) -> Float32[np.ndarray, "12"]:
-    """M = K' R K^-1 (rows first) and v = K' t of the motion from the first camera to the second."""
+    """M = K' R K^-1 (row-major) and v = K' t of the motion from the first camera to the second."""
     relative = second.viewmat.double() @ torch.linalg.inv(first.viewmat.double())
     M = second.K.double() @ relative[:3, :3] @ torch.linalg.inv(first.K.double())
     v = second.K.double() @ relative[:3, 3]
@@ -91,7 +91,7 @@ def _motion(first: Camera, second: Camera) -> Float32[np.ndarray, "12"]:
 
 
 def enlarged(planes: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float32[np.ndarray, "H W 3"]:
-    """Planes of a smaller picture, by the pixels of a larger one."""
+    """Upsamples planes to a higher resolution."""
     down, across = planes.shape[0] / height, planes.shape[1] / width
     y, x = (np.arange(height) + 0.5) * down, (np.arange(width) + 0.5) * across
     j, i = np.minimum(y.astype(int), planes.shape[0] - 1), np.minimum(x.astype(int), planes.shape[1] - 1)

@@ -1,4 +1,4 @@
-"""The search for the planes of one photo: coarse by photos alone, then fine with its neighbours' planes."""
+"""PatchMatch search for the planes of one photo, coarse to fine; the fine level uses its neighbours' planes too."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _DRAWS = 16
 _COARSE_SPREADS = (0.1, 0.05, 0.03, 0.02)
 _FINE_SPREADS = (0.02, 0.005)
 _NEARER, _FARTHER = 2.0, 50.0
-"""How many times nearer or farther surfaces may be than the points that a photo observes.
+"""Depth range of the search, as factors on the range of the points that a photo observes.
 
-The background may be far off; left out, it would match at some wrong, nearer depth.
+The far limit is generous: background beyond it would match at a wrong, nearer depth.
 """
 
 
@@ -36,13 +36,13 @@ class Search:
     """The search for the planes of one photo.
 
     Attributes:
-        photo: Which.
-        others: Its neighbours.
-        guesses: Inverse depths to begin with, at half the size.
-        bounds: Least and largest inverse depth.
-        up: The world's vertical in the camera's frame.
-        mask: The user's own mask; None where nothing is ignored.
-        seed: Of random planes.
+        photo: Index of the photo.
+        others: Indices of its neighbours.
+        guesses: Initial inverse depths, at half the resolution.
+        bounds: Minimum and maximum inverse depth.
+        up: Up direction of the world in the camera's frame.
+        mask: The user's mask; None if there is none.
+        seed: Seed of the random planes.
     """
 
     photo: int
@@ -64,19 +64,19 @@ class Search:
         camera: Camera,
         seed: int,
     ) -> Search | None:
-        """Prepares it.
+        """Prepares the search for a photo.
 
         Args:
             view: The photo.
-            photo: Its number.
-            others: Its neighbours' numbers.
-            seen: Points that it observes.
-            ground: The plane of the ground, where it is known (see `find_ground`).
-            camera: The photo's camera at half the size.
-            seed: Of random planes.
+            photo: Index of the photo.
+            others: Indices of its neighbours.
+            seen: Points that the photo observes.
+            ground: Ground plane of the scene, if it was found (see `find_ground`).
+            camera: Camera of the photo at half the resolution.
+            seed: Seed of the random planes.
 
         Returns:
-            None where there is nothing to compare, or nothing says how far to look.
+            None if the photo has no neighbours, or no points from which the depth range follows.
         """
         seen = seen[view.camera.project(seen)[1] > 0]
         if not others or len(seen) == 0:
@@ -90,16 +90,16 @@ class Search:
         return cls(photo, others, guesses, bounds, up, None if mask is None else mask.numpy(), seed)
 
     def begin(self, level: Level, found: Planes) -> None:
-        """Finds planes from guesses and at random, by photos alone."""
-        offsets, nothing = window_offsets(), np.zeros((0, 3), np.float32)
+        """Finds planes at half the resolution, from initial and random ones, by matching cost alone."""
+        offsets, no_planes = window_offsets(), np.zeros((0, 3), np.float32)
         planes, costs = found.of(self.photo)
-        arguments = self._arguments(level, nothing, level.layout)
-        drawn = (self.up, self.guesses, _DRAWS, self.seed, offsets, planes, costs)
-        launch(first_planes, *arguments, *drawn, items=len(costs))
-        self._improve(arguments, _COARSE_SPREADS, nothing[None], planes, costs)
+        arguments = self._arguments(level, no_planes, level.layout)
+        candidates = (self.up, self.guesses, _DRAWS, self.seed, offsets, planes, costs)
+        launch(first_planes, *arguments, *candidates, items=len(costs))
+        self._improve(arguments, _COARSE_SPREADS, no_planes[None], planes, costs)
 
     def refine(self, coarse: Level, found: Planes, level: Level, refined: Planes) -> None:
-        """Refines planes found at half the size, with regard to those found for the neighbours."""
+        """Refines coarse planes, with a penalty for disagreement with the neighbours' planes."""
         hints = np.zeros_like(found.of(self.photo)[0])
         hint_costs = np.full(hints.shape[:2], WORST, np.float32)
         back = coarse.motions(self.photo, self.others)
@@ -115,13 +115,13 @@ class Search:
         if self.mask is not None:
             costs[self.mask == 0] = WORST
 
-    def _arguments(self, level: Level, known: np.ndarray, known_layout: np.ndarray) -> tuple:
+    def _arguments(self, level: Level, coarse: np.ndarray, coarse_layout: np.ndarray) -> tuple:
         K = level.cameras[self.photo].K
         intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32)
         motions = level.motions(self.photo, self.others)
         best = min(3, math.ceil(len(self.others) / 2))
         pictures = (level.pixels, level.blocks, level.layout, self.photo, np.array(self.others), motions)
-        return (*pictures, known, known_layout, best), intrinsics, self.bounds
+        return (*pictures, coarse, coarse_layout, best), intrinsics, self.bounds
 
     def _improve(
         self,
@@ -141,12 +141,12 @@ class Search:
 def _guesses(
     camera: Camera, points: Float[Tensor, "P 3"], ground: Float[Tensor, "3"] | None
 ) -> Float32[np.ndarray, "H W G"]:
-    """Inverse depths of the points nearest to each pixel, and last of the ground, where it is known."""
+    """Inverse depths of the points nearest to each pixel, followed by that of the ground if it was found."""
     pixels, z = camera.project(points)
     pixels, z = pixels[z > 0].numpy(), z[z > 0].numpy()
     y, x = np.mgrid[: camera.height, : camera.width]
-    places = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
-    nearest = KDTree(pixels).query(places, k=min(_GUESSES, len(z)))[1]
+    centers = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+    nearest = KDTree(pixels).query(centers, k=min(_GUESSES, len(z)))[1]
     guesses = (1 / z)[nearest].reshape(camera.height, camera.width, -1)
     if ground is not None:
         upward = torch.tensor([-float(ground[0]), -float(ground[1]), 1.0])

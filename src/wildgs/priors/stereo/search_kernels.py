@@ -1,7 +1,7 @@
 """Numba (njit) kernels of PatchMatch stereo: the search for each pixel's plane (see `cost_kernels`).
 
-Pixels are updated red-black: those of one colour read only those of the other, so results do not depend on the
-number of threads.
+Pixels are updated in a red-black pattern: those of one colour read only those of the other, so results do not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ BAND = 8
 """Rows of a work item."""
 _MATHS = {"reassoc", "contract", "arcp", "nsz", "afn"}
 _STEEPEST = np.float32(0.03)
-"""Least cosine between a plane's normal and the ray to it."""
+"""Minimum cosine between a plane's normal and the viewing ray."""
 _FAR_STRIP = 11
 
 
 @njit(nogil=True, inline="always")
 def _random(state):
-    """The next of a pixel's own random numbers in [0, 1), and the state after it (xorshift)."""
+    """Next random number of a pixel in [0, 1), and the new state (xorshift)."""
     state ^= (state << np.uint32(13)) & np.uint32(0xFFFFFFFF)
     state ^= state >> np.uint32(17)
     state ^= (state << np.uint32(5)) & np.uint32(0xFFFFFFFF)
@@ -39,7 +39,7 @@ def _seeded(seed, y, x):
 
 @njit(nogil=True, inline="always")
 def _tilted(q, x, y, intrinsics, nx, ny, nz):
-    """Slope (q_x, q_y) of the plane with a normal in the camera's frame, and the cosine at which it is seen."""
+    """Slope (q_x, q_y) of the plane with a normal in the camera's frame, and the cosine of its viewing angle."""
     rx = (np.float32(x) + np.float32(0.5) - intrinsics[2]) / intrinsics[0]
     ry = (np.float32(y) + np.float32(0.5) - intrinsics[3]) / intrinsics[1]
     along = nx * rx + ny * ry + nz
@@ -51,7 +51,7 @@ def _tilted(q, x, y, intrinsics, nx, ny, nz):
 
 @njit(nogil=True, inline="always")
 def _too_steep(q, qx, qy, x, y, intrinsics):
-    """Whether a plane is seen at a more grazing angle than windows can be compared at."""
+    """Whether the viewing angle of a plane is too grazing for windows to match."""
     nx, ny = qx * intrinsics[0], qy * intrinsics[1]
     rx = (np.float32(x) + np.float32(0.5) - intrinsics[2]) / intrinsics[0]
     ry = (np.float32(y) + np.float32(0.5) - intrinsics[3]) / intrinsics[1]
@@ -61,7 +61,7 @@ def _too_steep(q, qx, qy, x, y, intrinsics):
 
 @njit(nogil=True, error_model="numpy")
 def _random_normal(state):
-    """A direction of the half sphere that faces the camera."""
+    """A random direction in the hemisphere that faces the camera."""
     a, state = _random(state)
     b, state = _random(state)
     nz = np.float32(0.3) + np.float32(0.7) * a
@@ -72,10 +72,11 @@ def _random_normal(state):
 
 @njit(nogil=True, fastmath=_MATHS, error_model="numpy")
 def first_planes(counter, compared, intrinsics, bounds, up, guesses, draws, seed, offsets, planes, costs):
-    """The best of each pixel's guesses (inverse depths of points nearby) and of random planes.
+    """Initialises each pixel with the best of its guesses (inverse depths of nearby points) and random planes.
 
-    `bounds` are the least and the largest inverse depth, `up` the world's vertical in the camera's frame. Guesses
-    are tried facing the camera and level. Windows without texture keep the first guess, at the worst cost.
+    `bounds` are the minimum and maximum inverse depth, `up` is the world's up direction in the camera's frame. Each
+    guess is tried as a fronto-parallel and as a level plane. Textureless windows keep the first guess at the worst
+    cost.
     """
     place = compared[2][compared[3]]
     width, height = place[1], place[2]
@@ -117,7 +118,7 @@ def first_planes(counter, compared, intrinsics, bounds, up, guesses, draws, seed
 
 @njit(nogil=True, inline="always")
 def carried_plane(planes, y, x, j, i):
-    """The plane of pixel (j, i), continued to (y, x)."""
+    """The plane of pixel (j, i), extrapolated to (y, x)."""
     qx, qy = planes[j, i, 1], planes[j, i, 2]
     return planes[j, i, 0] + qx * np.float32(x - i) + qy * np.float32(y - j), qx, qy
 
@@ -126,11 +127,11 @@ def carried_plane(planes, y, x, j, i):
 def improve_planes(
     counter, compared, intrinsics, bounds, colour, spread, seed, hints, offsets, planes, costs
 ):
-    """Half an iteration: pixels of one colour try the planes of the others around them, then changes of their own.
+    """Half an iteration: propagation from pixels of the other colour, then random refinement.
 
-    Of each of four directions, the plane next door and the best of a strip further out are tried; `spread` is the
-    size of random changes of inverse depth, as a share of it. `hints` are further planes to try (see
-    `carry_planes`), where there are any.
+    In each of four directions, the adjacent plane and the best of a strip further out are tried. `spread` is the
+    relative size of random perturbations of the inverse depth. `hints` are further candidate planes (see
+    `carry_planes`), or empty.
     """
     place = compared[2][compared[3]]
     width, height = place[1], place[2]
@@ -164,7 +165,7 @@ def improve_planes(
                         if i < 0 or j < 0 or i >= width or j >= height:
                             continue
                         tq, tx, ty = carried_plane(planes, y, x, j, i)
-                        # What differs by less than can be told is not tried again.
+                        # Skips planes that are indistinguishable from the current one.
                         if (
                             abs(tq - q) < np.float32(3e-4) * q
                             and abs(tx - qx) + abs(ty - qy) < np.float32(1e-4) * q

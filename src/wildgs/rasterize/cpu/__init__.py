@@ -1,4 +1,4 @@
-"""The CPU backend: Numba kernels behind the three functions of the rasteriser's interface."""
+"""The CPU backend: Numba kernels behind `project`, `blend` and `sh_to_colors`."""
 
 from wildgs.rasterize.cpu.blending import blend, blend_tiles
 from wildgs.rasterize.cpu.projection import project

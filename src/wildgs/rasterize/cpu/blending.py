@@ -15,11 +15,11 @@ from wildgs.rasterize.cpu.reach_kernels import TILE
 from wildgs.rasterize.interface import Projection, Rendering
 from wildgs.threads import flat, launch
 
-_CHUNK = 1024  # Gaussians that a thread takes at once
+_CHUNK = 1024  # Gaussians per work item of a thread
 
 
 class _Blend(torch.autograd.Function):
-    """Blending with the bookkeeping that its gradient needs."""
+    """Autograd function of blending."""
 
     @staticmethod
     def forward(
@@ -47,7 +47,7 @@ class _Blend(torch.autograd.Function):
         conics, depths, opacities, colors, background, out_depth, out_alpha = ctx.saved_tensors
         tiles: TileLists = ctx.tiles
         n, channels = colors.shape
-        # Rows are padded to whole vectors.
+        # Rows are padded to whole SIMD vectors.
         stride = -(-(backward_kernels.ROW_COLORS + channels) // 16) * 16
         v_means2d, v_conics = torch.empty(n, 2), torch.empty(n, 3)
         v_opacities, v_depths, v_values = (torch.empty(n), torch.empty(n), torch.empty(n, channels))
@@ -73,7 +73,7 @@ class _Blend(torch.autograd.Function):
 
 
 def _rank_values(tiles: TileLists, depths: Tensor, colors: Tensor) -> np.ndarray:
-    """Depths and colours in the order of ranks."""
+    """Depths and colours, sorted by rank."""
     values = np.empty(tiles.homes.size * (colors.shape[1] + 1), np.float32)
     launch(
         tile_kernels.rank_values,
@@ -91,12 +91,12 @@ def _blend_pictures(
     bookkeeping: bool,
     order: np.ndarray | None = None,
 ) -> Any:
-    """Runs the forward kernel; gives colours, depth, alpha, final transmittance and last positions."""
+    """Runs the forward kernel; returns colours, depth, alpha, final transmittance and last positions."""
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
     channels = colors.shape[1]
     order = tiles.tile_order if order is None else order
-    # Tiles that are left out are not written.
+    # The kernel does not write tiles that are left out.
     allocate = torch.empty if len(order) == len(tiles.tile_order) else torch.zeros
     values = _rank_values(tiles, projection.depths, colors)
     out_colors = allocate(height, width, channels)
@@ -133,7 +133,7 @@ def blend(
 def blend_tiles(
     projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
 ) -> Rendering:
-    """Blends some of the tiles; the picture is 0 in the others."""
+    """Blends only the chosen tiles; the image is 0 in the others."""
     order: np.ndarray = projection.tiles.tile_order
     background = colors.new_zeros(colors.shape[1])
     order = order[chosen.reshape(-1)[order]]

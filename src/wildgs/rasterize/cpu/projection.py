@@ -1,4 +1,4 @@
-"""Projection on the CPU: the autograd function around its kernels, tile lists, and reused working memory."""
+"""Projection on the CPU: the autograd function around its kernels, tile lists, and reused scratch memory."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _free: dict[str, np.ndarray] = {}
 
 @contextmanager
 def scratch(name: str, size: int, dtype: type) -> Iterator[np.ndarray]:
-    """A flat array with unknown content, kept under `name` afterwards.
+    """Provides an uninitialised flat array that is cached under `name` for reuse.
 
-    Threads that ask at the same time get arrays of their own; the largest is the one kept.
+    Concurrent requests get separate arrays, of which the largest is cached.
     """
     with _lock:
         array = _free.pop(name, None)
@@ -44,7 +44,7 @@ def scratch(name: str, size: int, dtype: type) -> Iterator[np.ndarray]:
 
 
 def _aligned(size: int, dtype: type) -> np.ndarray:
-    """A flat array that starts at a cache line."""
+    """A flat array aligned to a cache line."""
     item = np.dtype(dtype).itemsize
     raw = np.empty(size + 64 // item, dtype)
     skip = -raw.ctypes.data % 64 // item
@@ -56,19 +56,19 @@ GROUP = project_kernels.GROUP
 
 @dataclass(frozen=True)
 class TileLists:
-    """What blending reads of the geometry; arrays are flat.
+    """Tile lists and the geometry that blending reads, in flat arrays.
 
-    Gaussians that reach the picture are numbered by rank: neighbours in the picture are neighbours in memory.
+    Visible Gaussians are numbered by rank, so that neighbours in the image are neighbours in memory.
 
     Attributes:
-        ranks: Each Gaussian's rank; -1 where it reaches no tile.
-        homes: Each rank's Gaussian.
-        records: Per rank what blending reads, eight floats (see `reach_kernels.RECORD`).
-        starts: First slot of each rank's (tile, Gaussian) pairs, and the number of pairs.
-        offsets: Where each tile's list starts in `entries` (pairs); one more than there are tiles.
-        entries: Tile by tile, nearest first, two numbers: a rank, and the pair's slot among all ranks' pairs. They
-            are adjacent because they are written in random order.
-        tile_order: Tiles with long lists first, so that threads end together.
+        ranks: Rank of each Gaussian; -1 if it touches no tile.
+        homes: Index of the Gaussian of each rank.
+        records: Geometry of each rank, eight floats (see `reach_kernels.RECORD`).
+        starts: First slot of each rank's (tile, Gaussian) pairs, followed by the number of pairs.
+        offsets: Start of each tile's list in `entries` (in pairs), followed by the number of pairs.
+        entries: Two numbers per pair, tile by tile, nearest first: the rank, and the pair's slot among the pairs
+            sorted by rank. They are interleaved because they are written in random order.
+        tile_order: Tiles in the order of processing, longest lists first, to balance the threads.
     """
 
     ranks: np.ndarray
@@ -87,7 +87,7 @@ class TileLists:
 
 @dataclass(frozen=True)
 class _Lens:
-    """A camera as the kernels take it: `lens` is fx, fy, cx, cy, eps2d."""
+    """Camera parameters in the layout of the kernels: `lens` is fx, fy, cx, cy, eps2d."""
 
     view: np.ndarray
     lens: np.ndarray
@@ -106,18 +106,18 @@ class _Lens:
 
 
 def _padded(tensor: Tensor) -> Tensor:
-    """At least sixteen rows, which the vector kernels need; the rows added are zero and hence culled."""
+    """Pads to the sixteen rows that the SIMD kernels need; the added rows are zero and hence culled."""
     missing = GROUP - len(tensor)
     return tensor if missing <= 0 else torch.cat([tensor, tensor.new_zeros(missing, *tensor.shape[1:])])
 
 
 def _first(tensor: Tensor, n: int) -> Tensor:
-    """Undoes `_padded`; the tensor itself where nothing was added, as slicing costs a copy in the backward pass."""
+    """Undoes `_padded`. Returns an unpadded tensor itself, since slicing costs a copy in the backward pass."""
     return tensor if len(tensor) == n else tensor[:n]
 
 
 class _Project(torch.autograd.Function):
-    """Hands out what the projection kernel wrote; its backward pass is `project_backward`."""
+    """Autograd function of projection: returns the kernel's outputs; the backward pass is `project_backward`."""
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, lens: _Lens, outputs: Any) -> Any:
@@ -203,7 +203,7 @@ def _list_tiles(
     tile_counts: np.ndarray,
     camera: Camera,
 ) -> TileLists:
-    """Ranks the Gaussians and lists each tile's, nearest first (see `tile_kernels`)."""
+    """Ranks the Gaussians and builds the depth-sorted tile lists (see `tile_kernels`)."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     n = tile_counts.size
     seen = int(np.count_nonzero(tile_counts))
@@ -238,12 +238,12 @@ def _list_tiles(
         run_once(tile_kernels.place_chunks, cursors, offsets)
         pairs = numbered()
         if pairs >= 2**31:
-            raise UserError(f"{pairs:,} pairs of tile and Gaussian are too many; render a smaller picture")
+            raise UserError(f"too many pairs of tile and Gaussian ({pairs:,}); render at a lower resolution")
         entries = np.empty(2 * pairs, np.int32)
         launch(
             tile_kernels.write_pairs, nearest, spans, ranked_records, starts, tiles_x, cursors, entries,
             items=chunks,
         )  # fmt: skip
-    # By powers of two of the length: within one, neighbouring tiles follow each other and share the cache.
+    # Sorted by powers of two of the length: tiles of similar length keep their order, for cache locality.
     tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
     return TileLists(ranks, homes, ranked_records, starts, offsets, entries, tile_order)

@@ -14,11 +14,11 @@ from wildgs.rasterize.cpu import sh_kernels
 from wildgs.threads import flat, launch
 
 UNCLAMPED = -1e30
-"""Kernels are compiled for finite numbers."""
+"""Finite stand-in for minus infinity, since the kernels are compiled with fast-math."""
 
 
 class _Shade(torch.autograd.Function):
-    """Spherical harmonics of visible Gaussians."""
+    """Autograd function of spherical harmonics of visible Gaussians."""
 
     @staticmethod
     def forward(
