@@ -22,7 +22,7 @@ from wildgs.rasterize.cpu.reach_kernels import (
     RECORD,
     count_bits,
     inside_bits,
-    nearest_exponent,
+    least_falloff,
     window_mask,
 )
 from wildgs.rasterize.cpu.simd import mask_bits, select, splat, vfloor, vlog2, vmax, vmin, vsqrt
@@ -137,9 +137,11 @@ def project_group(
     vstore(spans, 0, select(seen, vmax(radius, 1.0), zero))
     if mask_bits(seen) == 0:
         return 0, 0, 0, 0, 0
-    A, B, C = -0.5 * LOG2_E * conic_a, -LOG2_E * conic_b, -0.5 * LOG2_E * conic_c
+    # The conic's Cholesky factor from the covariance: d^2 as a difference of conics would lose a needle's digits.
     y_per_x, x_per_y = b / a, b / c
-    vstore8(records, RECORD * i, (mx, my, A, B, C, level, y_per_x, x_per_y))
+    factor_a, factor_d = vsqrt(0.5 * LOG2_E * select(sound, conic_a, 1.0)), vsqrt(0.5 * LOG2_E / c)
+    factor_b = -x_per_y * factor_a
+    vstore8(records, RECORD * i, (mx, my, factor_a, factor_b, factor_d, level, y_per_x, x_per_y))
 
     # Pixels whose centres lie in the ellipse's box, then their tiles; there may be no such pixel.
     left, top = -vfloor(-vmax(mx - hx - 0.5, 0.0)), -vfloor(-vmax(my - hy - 0.5, 0.0))
@@ -152,17 +154,18 @@ def project_group(
     vstore(spans, 3 * GROUP, x1)
     vstore(spans, 4 * GROUP, y1)
     left, top = x0 * 16.0 + 0.5 - mx, y0 * 16.0 + 0.5 - my
-    floor = REACH - level
+    factor = (factor_a, factor_b, factor_d, y_per_x, x_per_y)
+    limit = level - REACH
     near_x, near_y, far_x, far_y = left + 15.0, top + 15.0, left + 31.0, top + 31.0
-    nn = nearest_exponent(left, top, near_x, near_y, A, B, C, y_per_x, x_per_y)
-    fn = nearest_exponent(left + 16.0, top, far_x, near_y, A, B, C, y_per_x, x_per_y)
-    nf = nearest_exponent(left, top + 16.0, near_x, far_y, A, B, C, y_per_x, x_per_y)
-    ff = nearest_exponent(left + 16.0, top + 16.0, far_x, far_y, A, B, C, y_per_x, x_per_y)
+    nn = least_falloff(left, top, near_x, near_y, *factor)
+    fn = least_falloff(left + 16.0, top, far_x, near_y, *factor)
+    nf = least_falloff(left, top + 16.0, near_x, far_y, *factor)
+    ff = least_falloff(left + 16.0, top + 16.0, far_x, far_y, *factor)
     wide, tall = seen & (x1 > x0), seen & (y1 > y0)
     return (
-        mask_bits(seen & (nn >= floor)),
-        mask_bits(wide & (fn >= floor)),
-        mask_bits(tall & (nf >= floor)),
-        mask_bits(wide & tall & (ff >= floor)),
+        mask_bits(seen & (nn <= limit)),
+        mask_bits(wide & (fn <= limit)),
+        mask_bits(tall & (nf <= limit)),
+        mask_bits(wide & tall & (ff <= limit)),
         mask_bits((x1 - x0 < 2.0) & (y1 - y0 < 2.0)),
     )
