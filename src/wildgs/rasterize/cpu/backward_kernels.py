@@ -108,95 +108,98 @@ def blend_backward(
             at = np.int64(entries[2 * p + 1]) * row_size
             for k in range(0, row_size, LANES):
                 vstore(rows, at + k, splat(0.0))
-        for p in range(begin + end - 1, begin - 1, -1):
-            soon = max(p - AHEAD, 0)
-            prefetch(records, np.int64(entries[2 * soon]) * RECORD)
-            prefetch(values, np.int64(entries[2 * soon]) * (channels + 1))
-            prefetch_to_write(rows, np.int64(entries[2 * soon + 1]) * row_size)
-            position = np.float32(p - begin + 1)
-            blocks = np.int64(masks[p]) & mask_bits(vload(farthest, 0) >= position)
-            rank, slot = np.int64(entries[2 * p]), np.int64(entries[2 * p + 1])
-            gather_pair(
-                position, blocks, records, values, rank, np.float32(tx * TILE) + HALF, np.float32(ty * TILE) + HALF,
-                channels, with_depth, absgrad, stride, v, places, v_color, rows, slot * row_size,
-            )  # fmt: skip
+        gather_tile(
+            begin, end, np.float32(tx * TILE) + HALF, np.float32(ty * TILE) + HALF, entries, records, values, masks,
+            farthest, channels, with_depth, absgrad, stride, v, places, v_color, row_size, rows,
+        )  # fmt: skip
 
 
-@njit(nogil=True, inline="always")
-def gather_pair(
-    position, blocks, records, values, rank, origin_x, origin_y, channels, with_depth, absgrad, stride, v, places,
-    v_color, rows, to,
+@njit(nogil=True)
+def gather_tile(
+    begin, end, origin_x, origin_y, entries, records, values, masks, farthest,
+    channels, with_depth, absgrad, stride, v, places, v_color, row_size, rows,
 ):  # fmt: skip
-    """Sums one Gaussian's gradients over the blocks that it reaches in a tile, into its row at `to`."""
+    """Sums each Gaussian's gradients over the blocks that it reaches in a tile, into the pair's row.
+
+    A function of its own because arrays that a function is given are not counted, in loops, as references to them.
+    """
     zero = splat(0.0)
-    r = rank * RECORD
-    x, y = origin_x - records[r], origin_y - records[r + 1]
-    a, b, d = records[r + 2], records[r + 3], records[r + 4]
-    first_u, first_v = splat(a * x + b * y), splat(d * y)
-    level = vspread(records, r + 5)
-    first = rank * (channels + 1)
-    depth, red, green, blue = vspread(values, first), zero, zero, zero
-    if channels == 3:
-        red, green, blue = (
-            vspread(values, first + 1),
-            vspread(values, first + 2),
-            vspread(values, first + 3),
-        )
-    q0, qu, qv, quu, quv, qvv = zero, zero, zero, zero, zero, zero
-    abs_x, abs_y, v_d, v_red, v_green, v_blue = zero, zero, zero, zero, zero, zero
-    if channels != 3:
-        v_color[:] = 0.0
-    while blocks != 0:
-        block = lowest_bit(blocks)
-        blocks &= blocks - 1
-        at = block * stride
-        px, py = vload(places, block * 2 * LANES), vload(places, block * 2 * LANES + LANES)
-        # As in the forward pass, to the last bit, so that both see the same hits.
-        u_, v_ = fma(px, a, fma(py, b, first_u)), fma(py, d, first_v)
-        exponent = fma(-u_, u_, fma(-v_, v_, level))
-        hit = (exponent >= MIN_LEVEL) & (vload(v, at + REACHED) >= position)
-        raw = vexp2(exponent)
-        alpha = select(hit, vmin(raw, MAX_ALPHA), zero)
-        # T = T_behind / (1 - alpha), so that alpha T = ratio T_behind and T = T_behind + alpha T.
-        ratio = vratio(alpha, 1.0 - alpha)
-        behind = vload(v, at)
-        weight = ratio * behind
-        vstore(v, at, behind + weight)
-        pull = vload(v, at + V_ALPHA)
-        if with_depth:
-            vd = vload(v, at + V_DEPTH)
-            pull = fma(vd, depth, pull)
-            v_d = fma(weight, vd, v_d)
+    for p in range(begin + end - 1, begin - 1, -1):
+        soon = max(p - AHEAD, 0)
+        prefetch(records, np.int64(entries[2 * soon]) * RECORD)
+        prefetch(values, np.int64(entries[2 * soon]) * (channels + 1))
+        prefetch_to_write(rows, np.int64(entries[2 * soon + 1]) * row_size)
+        position = splat(np.float32(p - begin + 1))
+        blocks = np.int64(masks[p]) & mask_bits(vload(farthest, 0) >= position)
+        rank, to = np.int64(entries[2 * p]), np.int64(entries[2 * p + 1]) * row_size
+        r = rank * RECORD
+        x, y = origin_x - records[r], origin_y - records[r + 1]
+        a, b, d = records[r + 2], records[r + 3], records[r + 4]
+        first_u, first_v = splat(a * x + b * y), splat(d * y)
+        level = vspread(records, r + 5)
+        first = rank * (channels + 1)
+        depth, red, green, blue = vspread(values, first), zero, zero, zero
         if channels == 3:
-            v0, v1 = vload(v, at + V_COLORS), vload(v, at + V_COLORS + LANES)
-            v2 = vload(v, at + V_COLORS + 2 * LANES)
-            pull = fma(v0, red, fma(v1, green, fma(v2, blue, pull)))
-            v_red, v_green, v_blue = (
-                fma(weight, v0, v_red),
-                fma(weight, v1, v_green),
-                fma(weight, v2, v_blue),
+            red, green, blue = (
+                vspread(values, first + 1),
+                vspread(values, first + 2),
+                vspread(values, first + 3),
             )
-        else:
-            for k in range(channels):
-                vk = vload(v, at + V_COLORS + k * LANES)
-                pull = fma(vk, vspread(values, first + 1 + k), pull)
-                vstore(v_color, k * LANES, fma(weight, vk, vload(v_color, k * LANES)))
-        rest, gain = vload(v, at + BEHIND), weight * pull
-        vstore(v, at + BEHIND, rest + gain)
-        # Where alpha is capped it does not move with its exponent.
-        q = select(raw <= MAX_ALPHA, fma(-ratio, rest, gain), zero)
-        qu1, qv1 = q * u_, q * v_
-        q0, qu, qv = q0 + q, qu + qu1, qv + qv1
-        quu, quv, qvv = fma(qu1, u_, quu), fma(qu1, v_, quv), fma(qv1, v_, qvv)
-        if absgrad:
-            # The exponent moves by -2 a u per pixel in x and by -2 (b u + d v) in y; the factor comes at the end.
-            ax, ay = a * qu1, fma(qu1, b, qv1 * d)
-            abs_x, abs_y = abs_x + vmax(ax, -ax), abs_y + vmax(ay, -ay)
-    vstore(rows, to, lane_sums((
-        q0, qu, qv, quu, quv, qvv, abs_x, abs_y, v_d, v_red, v_green, v_blue, zero, zero, zero, zero
-    )))  # fmt: skip
-    if channels != 3:
-        store_colors(rows, to + ROW_COLORS, v_color, channels)
+        q0, qu, qv, quu, quv, qvv = zero, zero, zero, zero, zero, zero
+        abs_x, abs_y, v_d, v_red, v_green, v_blue = zero, zero, zero, zero, zero, zero
+        if channels != 3:
+            v_color[:] = 0.0
+        while blocks != 0:
+            block = lowest_bit(blocks)
+            blocks &= blocks - 1
+            at = block * stride
+            px, py = vload(places, block * 2 * LANES), vload(places, block * 2 * LANES + LANES)
+            # As in the forward pass, to the last bit, so that both see the same hits.
+            u_, v_ = fma(px, a, fma(py, b, first_u)), fma(py, d, first_v)
+            exponent = fma(-u_, u_, fma(-v_, v_, level))
+            hit = (exponent >= MIN_LEVEL) & (vload(v, at + REACHED) >= position)
+            raw = vexp2(exponent)
+            alpha = select(hit, vmin(raw, MAX_ALPHA), zero)
+            # T = T_behind / (1 - alpha), so that alpha T = ratio T_behind and T = T_behind + alpha T.
+            ratio = vratio(alpha, 1.0 - alpha)
+            behind = vload(v, at)
+            weight = ratio * behind
+            vstore(v, at, behind + weight)
+            pull = vload(v, at + V_ALPHA)
+            if with_depth:
+                vd = vload(v, at + V_DEPTH)
+                pull = fma(vd, depth, pull)
+                v_d = fma(weight, vd, v_d)
+            if channels == 3:
+                v0, v1 = vload(v, at + V_COLORS), vload(v, at + V_COLORS + LANES)
+                v2 = vload(v, at + V_COLORS + 2 * LANES)
+                pull = fma(v0, red, fma(v1, green, fma(v2, blue, pull)))
+                v_red, v_green, v_blue = (
+                    fma(weight, v0, v_red),
+                    fma(weight, v1, v_green),
+                    fma(weight, v2, v_blue),
+                )
+            else:
+                for k in range(channels):
+                    vk = vload(v, at + V_COLORS + k * LANES)
+                    pull = fma(vk, vspread(values, first + 1 + k), pull)
+                    vstore(v_color, k * LANES, fma(weight, vk, vload(v_color, k * LANES)))
+            rest, gain = vload(v, at + BEHIND), weight * pull
+            vstore(v, at + BEHIND, rest + gain)
+            # Where alpha is capped it does not move with its exponent.
+            q = select(raw <= MAX_ALPHA, fma(-ratio, rest, gain), zero)
+            qu1, qv1 = q * u_, q * v_
+            q0, qu, qv = q0 + q, qu + qu1, qv + qv1
+            quu, quv, qvv = fma(qu1, u_, quu), fma(qu1, v_, quv), fma(qv1, v_, qvv)
+            if absgrad:
+                # The exponent moves by -2 a u per pixel in x and by -2 (b u + d v) in y; the factor comes at the end.
+                ax, ay = a * qu1, fma(qu1, b, qv1 * d)
+                abs_x, abs_y = abs_x + vmax(ax, -ax), abs_y + vmax(ay, -ay)
+        vstore(rows, to, lane_sums((
+            q0, qu, qv, quu, quv, qvv, abs_x, abs_y, v_d, v_red, v_green, v_blue, zero, zero, zero, zero
+        )))  # fmt: skip
+        if channels != 3:
+            store_colors(rows, to + ROW_COLORS, v_color, channels)
 
 
 @njit(nogil=True)

@@ -72,7 +72,7 @@ def project_forward(
                 tile_counts[g] = count
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def pack_box(x0, y0, x1, y1):
     """First and last column and row of tiles in one number, so that it is moved at once."""
     return x0 | (y0 << 16) | (x1 << 32) | (y1 << 48)

@@ -22,7 +22,7 @@ AHEAD = 16  # items between asking for what an item needs and using it
 DIGIT = 12  # bits per radix pass, so that the counts stay in the fastest cache
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def home_tile(box, tiles_x):
     """The tile in which a box (see `project_kernels.pack_box`) starts."""
     return ((box >> 16) & 0xFFFF) * tiles_x + (box & 0xFFFF)
@@ -211,7 +211,7 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
                     slot = write_window(bits, ty * tiles_x + tx, tiles_x, rank, slot, row, entries)
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def write_window(bits, first, tiles_x, rank, slot, row, entries):
     """Writes a pair for each tile of a window of 4 x 4 whose bit is set; returns the next slot."""
     while bits != 0:
