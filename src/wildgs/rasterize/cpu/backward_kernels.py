@@ -18,6 +18,7 @@ from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, ask_for_tile, l
 from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, RECORD, TILE
 from wildgs.rasterize.cpu.simd import (
     LANES,
+    SUM_LANES,
     fma,
     lane_sums,
     lane_x,
@@ -34,8 +35,10 @@ from wildgs.rasterize.cpu.simd import (
 from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vspread, vstore
 from wildgs.threads import fetch_add
 
-# A pair's row: six moments, |d x|, |d y| (absgrad), depth, then colours; whole vectors.
-ROW_ABS, ROW_DEPTH, ROW_COLORS = 6, 8, 9
+# A pair's row: one vector of sums (moments, depth, three colours, and |d x|, |d y| for absgrad), each in the lane where
+# `lane_sums` puts it. Where there are not three colours, they follow; whole vectors.
+Q, QU, QV, QUU, QUV, QVV, Q_DEPTH, Q_RED, Q_GREEN, Q_BLUE, ABS_X, ABS_Y = SUM_LANES
+ROW_COLORS = 16
 # A block's numbers lie together: transmittance behind what was visited so far, then at these offsets the sum of w g
 # behind, the last blended position, and the gradients of accumulated alpha, depth sum and colours.
 BEHIND, REACHED, V_ALPHA, V_DEPTH, V_COLORS = 16, 32, 48, 64, 80
@@ -192,11 +195,11 @@ def gather_tile(
             q0, qu, qv = q0 + q, qu + qu1, qv + qv1
             quu, quv, qvv = fma(qu1, u_, quu), fma(qu1, v_, quv), fma(qv1, v_, qvv)
             if absgrad:
-                # The exponent moves by -2 a u per pixel in x and by -2 (b u + d v) in y; the factor comes at the end.
+                # Per pixel the exponent moves by -2 a u in x and -2 (b u + d v) in y; the factor comes at the end.
                 ax, ay = a * qu1, fma(qu1, b, qv1 * d)
                 abs_x, abs_y = abs_x + vmax(ax, -ax), abs_y + vmax(ay, -ay)
         vstore(rows, to, lane_sums((
-            q0, qu, qv, quu, quv, qvv, abs_x, abs_y, v_d, v_red, v_green, v_blue, zero, zero, zero, zero
+            q0, qu, qv, quu, quv, qvv, v_d, v_red, v_green, v_blue, abs_x, abs_y
         )))  # fmt: skip
         if channels != 3:
             store_colors(rows, to + ROW_COLORS, v_color, channels)
@@ -241,17 +244,21 @@ def sum_rows(
                 r = rank * RECORD
                 a, b, d = records[r + 2], records[r + 3], records[r + 4]
             # d ln alpha / d centre = 2 ln 2 (a u, b u + d v), and u = a dx + b dy, v = d dy.
-            v_means2d[2 * g] = two_ln2 * a * total[1]
-            v_means2d[2 * g + 1] = two_ln2 * (b * total[1] + d * total[2])
+            v_means2d[2 * g] = two_ln2 * a * total[QU]
+            v_means2d[2 * g + 1] = two_ln2 * (b * total[QU] + d * total[QV])
             x_u, x_v, y_v = one / a, -b / (a * d), one / d
-            dx_dv = x_u * total[4] + x_v * total[5]
-            v_conics[3 * g] = -half * (x_u * (x_u * total[3] + x_v * total[4]) + x_v * dx_dv)
+            dx_dv = x_u * total[QUV] + x_v * total[QVV]
+            v_conics[3 * g] = -half * (x_u * (x_u * total[QUU] + x_v * total[QUV]) + x_v * dx_dv)
             v_conics[3 * g + 1] = -y_v * dx_dv
-            v_conics[3 * g + 2] = -half * y_v * y_v * total[5]
-            v_opacities[g] = total[0] / opacities[g] if zero < opacities[g] <= 1.0 else zero
-            v_depths[g] = total[ROW_DEPTH]
-            for k in range(channels):
-                v_colors[channels * g + k] = total[ROW_COLORS + k]
+            v_conics[3 * g + 2] = -half * y_v * y_v * total[QVV]
+            v_opacities[g] = total[Q] / opacities[g] if zero < opacities[g] <= 1.0 else zero
+            v_depths[g] = total[Q_DEPTH]
+            if channels == 3:
+                v_colors[3 * g], v_colors[3 * g + 1] = total[Q_RED], total[Q_GREEN]
+                v_colors[3 * g + 2] = total[Q_BLUE]
+            else:
+                for k in range(channels):
+                    v_colors[channels * g + k] = total[ROW_COLORS + k]
             if v_absolute is not None:
-                v_absolute[2 * g] += two_ln2 * total[ROW_ABS]
-                v_absolute[2 * g + 1] += two_ln2 * total[ROW_ABS + 1]
+                v_absolute[2 * g] += two_ln2 * total[ABS_X]
+                v_absolute[2 * g + 1] += two_ln2 * total[ABS_Y]

@@ -36,8 +36,8 @@ class _Blend(torch.autograd.Function):
     ) -> Any:
         tiles: TileLists = projection.tiles
         pictures = _blend_pictures(projection, colors, background, with_depth, bookkeeping=True)
-        out_colors, out_depth, out_alpha, ctx.masks, ctx.transmittance, ctx.last = pictures
-        ctx.save_for_backward(depths, opacities, colors, background, out_depth, out_alpha)
+        out_colors, out_depth, out_alpha, ctx.values, ctx.masks, ctx.transmittance, ctx.last = pictures
+        ctx.save_for_backward(opacities, colors, background, out_depth, out_alpha)
         ctx.tiles, ctx.camera, ctx.absgrad = (tiles, projection.camera, projection.absgrad)
         ctx.with_depth = with_depth
         return out_colors, out_depth, out_alpha
@@ -45,11 +45,11 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         v_colors, v_depth, v_alpha = grads
-        depths, opacities, colors, background, out_depth, out_alpha = ctx.saved_tensors
+        opacities, colors, background, out_depth, out_alpha = ctx.saved_tensors
         tiles: TileLists = ctx.tiles
         n, channels = colors.shape
-        # Rows are padded to whole vectors.
-        stride = -(-(backward_kernels.ROW_COLORS + channels) // 16) * 16
+        # Whole vectors: one for all sums, and further ones for colours that are not three.
+        stride = backward_kernels.ROW_COLORS + (0 if channels == 3 else -(-channels // LANES) * LANES)
         v_means2d, v_conics = torch.empty(n, 2), torch.empty(n, 3)
         v_opacities, v_depths, v_values = (torch.empty(n), torch.empty(n), torch.empty(n, channels))
         absgrad = None if ctx.absgrad is None else flat(ctx.absgrad)
@@ -57,7 +57,7 @@ class _Blend(torch.autograd.Function):
             launch(
                 backward_kernels.blend_backward,
                 tiles.tile_order, tiles.offsets, tiles.entries, tiles.records,
-                _rank_values(tiles, depths, colors), channels, ctx.with_depth, flat(background),
+                ctx.values, channels, ctx.with_depth, flat(background),
                 ctx.camera.width, ctx.camera.height, ctx.masks, ctx.transmittance, ctx.last,
                 flat(out_depth), flat(out_alpha), flat(v_colors), flat(v_depth), flat(v_alpha),
                 stride, rows, absgrad is not None,
@@ -93,7 +93,7 @@ def _blend_pictures(
     bookkeeping: bool,
     order: np.ndarray | None = None,
 ) -> Any:
-    """Runs the forward kernel; gives colours, depth, alpha, masks, final transmittance and last positions."""
+    """Runs the forward kernel; gives colours, depth, alpha, values, masks, final transmittance and last positions."""
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
     channels = colors.shape[1]
@@ -116,7 +116,7 @@ def _blend_pictures(
     )  # fmt: skip
     if not with_depth:
         out_depth = out_depth.expand(height, width)
-    return out_colors, out_depth, out_alpha, masks, transmittance, last
+    return out_colors, out_depth, out_alpha, values, masks, transmittance, last
 
 
 def blend(

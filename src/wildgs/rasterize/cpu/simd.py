@@ -289,9 +289,13 @@ def vexp2(typingctx, value):
         rounded = builder.fadd(x, rounder)
         rest = builder.fsub(x, builder.fsub(rounded, rounder))
         whole = builder.bitcast(rounded, INT_VECTOR)
-        power = _constant([_EXP2[0]] * LANES)
-        for coefficient in _EXP2[1:]:
-            power = _fused(builder, power, rest, _constant([coefficient] * LANES))
+        # Estrin's order: one operation more than Horner's, but no chain of five.
+        fifth, fourth, third, second, first, zeroth = (_constant([c] * LANES) for c in _EXP2)
+        square = builder.fmul(rest, rest)
+        power = _fused(
+            builder, _fused(builder, fifth, rest, fourth), square, _fused(builder, third, rest, second)
+        )
+        power = _fused(builder, power, square, _fused(builder, first, rest, zeroth))
         shift = ir.Constant(INT_VECTOR, [23] * LANES)
         bits = builder.add(builder.bitcast(power, INT_VECTOR), builder.shl(whole, shift))
         return builder.bitcast(bits, VECTOR_IR)
@@ -336,15 +340,23 @@ def vfloor(typingctx, value):
     return (VECTOR(value), codegen) if value is VECTOR else None
 
 
+# Where `lane_sums` puts its sums: as few of the tree's nodes as can be have one child alone.
+SUM_LANES = (0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13)
+
+
 @intrinsic
 def lane_sums(typingctx, vectors):
-    """Lane i of the result is the sum over the lanes of `vectors[i]`, a tuple of 16 vectors."""
-    if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR and len(vectors) == LANES):
+    """Lane `SUM_LANES[i]` of the result is the sum over the lanes of `vectors[i]`, a tuple of at most 12 vectors."""
+    if not (
+        isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR and len(vectors) <= len(SUM_LANES)
+    ):
         return None
 
     def codegen(context, builder, sig, args):
-        level = [builder.extract_value(args[0], i) for i in range(LANES)]
-        # Fold halves of two vectors into one, four times: 15 additions in all instead of 16 full reductions.
+        level: list[ir.Value | None] = [None] * LANES
+        for i in range(len(vectors)):
+            level[SUM_LANES[i]] = builder.extract_value(args[0], i)
+        # Fold halves of two vectors into one, four times: 12 additions in all instead of 12 full reductions.
         for half in (8, 4, 2, 1):
             count = len(level) // 2
             level = [_fold(builder, level[i], level[i + count], half) for i in range(count)]
@@ -353,7 +365,11 @@ def lane_sums(typingctx, vectors):
     return VECTOR(vectors), codegen
 
 
-def _fold(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, half: int) -> ir.Value:
+def _fold(builder: ir.IRBuilder, a: ir.Value | None, b: ir.Value | None, half: int) -> ir.Value | None:
+    if a is None:
+        return None
+    if b is None:
+        b = ir.Constant(VECTOR_IR, ir.Undefined)
     low, high = [], []
     for i in range(LANES):
         # Groups of `half` lanes alternate between a and b; each takes both halves of its double group.
