@@ -206,9 +206,15 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
             break
         row = cursors[chunk]
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
-            soon = nearest[min(i + AHEAD, count - 1)]
+            soon = nearest[min(i + 2 * AHEAD, count - 1)]
             prefetch(spans, 4 * soon)
             prefetch(starts, soon)
+            soon = 4 * np.int64(nearest[min(i + AHEAD, count - 1)])
+            first = (spans[soon] >> 16) * tiles_x + (spans[soon] & 0xFFFF)
+            # The places of most of its pairs; asking for the right ones alone would take branches.
+            prefetch_to_write(entries, 2 * row[first])
+            prefetch_to_write(entries, 2 * row[first + 1])
+            prefetch_to_write(entries, 2 * row[first + tiles_x])
             rank = nearest[i]
             slot = starts[rank]
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
