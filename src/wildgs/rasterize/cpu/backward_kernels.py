@@ -35,8 +35,8 @@ from wildgs.rasterize.cpu.simd import (
 from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vspread, vstore
 from wildgs.threads import fetch_add
 
-# A pair's row: one vector of sums (moments, depth, three colours, and |d x|, |d y| for absgrad), each in the lane where
-# `lane_sums` puts it. Where there are not three colours, they follow; whole vectors.
+# A pair's row: one vector of sums (moments, depth, three colours, and |d x|, |d y| for absgrad), each in the lane
+# where `lane_sums` puts it. Where there are not three colours, they follow; whole vectors.
 Q, QU, QV, QUU, QUV, QVV, Q_DEPTH, Q_RED, Q_GREEN, Q_BLUE, ABS_X, ABS_Y = SUM_LANES
 ROW_COLORS = 16
 # A block's numbers lie together: transmittance behind what was visited so far, then at these offsets the sum of w g

@@ -93,7 +93,10 @@ def _blend_pictures(
     bookkeeping: bool,
     order: np.ndarray | None = None,
 ) -> Any:
-    """Runs the forward kernel; gives colours, depth, alpha, values, masks, final transmittance and last positions."""
+    """Runs the forward kernel.
+
+    Gives colours, depth, alpha, and for the backward pass values by rank, masks, final transmittance, last positions.
+    """
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
     channels = colors.shape[1]

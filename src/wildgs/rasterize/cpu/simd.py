@@ -346,7 +346,7 @@ SUM_LANES = (0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13)
 
 @intrinsic
 def lane_sums(typingctx, vectors):
-    """Lane `SUM_LANES[i]` of the result is the sum over the lanes of `vectors[i]`, a tuple of at most 12 vectors."""
+    """Lane `SUM_LANES[i]` of the result is the sum over the lanes of `vectors[i]`, of at most 12."""
     if not (
         isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR and len(vectors) <= len(SUM_LANES)
     ):

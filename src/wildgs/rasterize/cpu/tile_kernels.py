@@ -15,7 +15,7 @@ import numpy as np
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.reach_kernels import RECORD, inside_bits, window_mask
 from wildgs.rasterize.cpu.simd import lowest_bit
-from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write
+from wildgs.rasterize.cpu.simd_memory import copy8, prefetch, prefetch_to_write
 from wildgs.threads import fetch_add
 
 AHEAD = 16  # items between asking for what an item needs and using it
@@ -85,8 +85,7 @@ def move_home(
                 rank = ranks[g]
                 if rank >= 0:
                     homes[rank] = g
-                    for k in range(RECORD):
-                        ranked_records[RECORD * rank + k] = records[RECORD * g + k]
+                    copy8(ranked_records, RECORD * rank, records, RECORD * g)
                     spans[4 * rank], spans[4 * rank + 1] = np.int32(boxes[g]), np.int32(boxes[g] >> 32)
                     spans[4 * rank + 2] = masks[g]
                     spans[4 * rank + 3] = tile_counts[g]
@@ -155,8 +154,8 @@ def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
 def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors):
     """Pairs per (chunk of the depth order, tile), into `cursors`; the order as ranks, into `nearest`.
 
-    Rows of `cursors` have tiles_x + 2 numbers more than there are tiles: a small box adds 0 to tiles that it does not
-    reach, as a loop over those that it does is mispredicted at most Gaussians.
+    Rows of `cursors` have tiles_x + 2 numbers more than there are tiles: a small box adds 0 to tiles that it does
+    not reach, as a loop over those that it does is mispredicted at most Gaussians.
     """
     chunks, count = cursors.shape[0], order.size
     while True:
@@ -197,7 +196,7 @@ def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors
 
 @njit(nogil=True)
 def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entries):
-    """Writes each pair's rank and slot, tile by tile, nearest first; after the last pair there is room for one more."""
+    """Writes each pair's rank and slot, tile by tile, nearest first; after the last there is room for one more."""
     spare = entries.size // 2 - 1
     chunks, count = cursors.shape[0], nearest.size
     while True:
