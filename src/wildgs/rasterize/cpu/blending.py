@@ -95,7 +95,7 @@ def _blend_pictures(
 ) -> Any:
     """Runs the forward kernel.
 
-    Gives colours, depth, alpha, and for the backward pass values by rank, masks, final transmittance, last positions.
+    Gives colours, depth, alpha; for the backward pass values by rank, masks, final transmittance, last positions.
     """
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
