@@ -3,6 +3,8 @@
     python benchmarks/rasterize.py                 the table: N in 10k, 100k, 1M at three sizes
     python benchmarks/rasterize.py --quick         100k at 640 x 480 alone
     python benchmarks/rasterize.py --json          a row a line, each as soon as it is measured
+    python benchmarks/rasterize.py --quick --against COMMIT --runs 50
+                                                   this tree and that commit in turns, each in a process of its own
 
 The scene: half of the Gaussians on a facade at depth 4, the rest uniform between depths 2 and 6, log-normal scales
 around 0.01, opacities uniform in [0, 1], focal length 0.9 widths. A run blends three channels and depth. Forward
@@ -18,20 +20,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from statistics import median
 
 import numpy as np
 import torch
 from numba import njit
-from torch import Tensor
 
-from wildgs.geometry.camera import Camera
-from wildgs.rasterize import BackendName, Projection, blend, project
+from rasterize_against import compare
+from rasterize_scene import make_scene, time_once, timed
+from wildgs.rasterize import BackendName, Projection
 from wildgs.rasterize.cpu.reach_kernels import HALF, RECORD, count_bits, reach
 from wildgs.rasterize.cpu.simd import fma, splat, vexp2
 from wildgs.rasterize.cpu.simd_memory import vstore
@@ -65,26 +64,6 @@ class Row:
     share_of_peak_forward: float | None = None
     share_of_peak_backward: float | None = None
     times_faster_than_reference: float | None = None
-
-
-def make_scene(n: int, width: int, height: int, seed: int = 0) -> tuple[list[Tensor], Camera]:
-    """Means, quaternions, scales, opacities and colours, and the camera."""
-    g = torch.Generator().manual_seed(seed)
-    focal = 0.9 * width
-    depth = torch.where(torch.arange(n) % 2 == 0, 4.0, 2 + 4 * torch.rand(n, generator=g))
-    x = (torch.rand(n, generator=g) - 0.5) * width / focal * depth
-    y = (torch.rand(n, generator=g) - 0.5) * height / focal * depth
-    scales = torch.exp(math.log(0.01) + 0.5 * torch.randn(n, 3, generator=g))
-    quats = torch.randn(n, 4, generator=g)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    inputs = [
-        torch.stack([x, y, depth], 1),
-        quats,
-        scales,
-        torch.rand(n, generator=g),
-        torch.rand(n, 3, generator=g),
-    ]
-    return inputs, Camera(torch.eye(4), K, width, height)
 
 
 @njit(nogil=True, cache=True)
@@ -132,46 +111,24 @@ def count_blocks(offsets, entries, records, tiles_x):
     return total
 
 
-def timed(call: Callable[[], object]) -> float:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    start = time.perf_counter()
-    call()
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return time.perf_counter() - start
-
-
 def measure(backend: BackendName, n: int, width: int, height: int, runs: int) -> Row:
     """Times one combination; see the module's words."""
     inputs, camera = make_scene(n, width, height)
     if backend == "cuda":
         inputs, camera = [t.cuda() for t in inputs], camera.to("cuda")
     leaves = [t.requires_grad_() for t in inputs]
-    found: dict[str, Projection] = {}
-    pictures: list[Tensor] = []
-
-    def forward() -> None:
-        found["projection"] = project(*leaves[:4], camera, backend=backend)
-        rendering = blend(found["projection"], leaves[4])
-        pictures[:] = [rendering.colors, rendering.depth, rendering.alpha]
-
-    forward_times, backward_times = [], []
+    forward_times, backward_times, projection = [], [], None
     for run in range(runs + 2):
-        seconds = timed(forward)
-        pulls = [torch.rand_like(p) for p in pictures]
-        for leaf in leaves:
-            leaf.grad = None
-        pull_back = timed(lambda pulls=pulls: torch.autograd.backward(pictures, pulls))
+        forward, backward, projection = time_once(leaves, camera, backend)
         if run >= 2:
-            forward_times.append(1e3 * seconds)
-            backward_times.append(1e3 * pull_back)
+            forward_times.append(forward)
+            backward_times.append(backward)
     row = Row(
         backend, n, width, height, thread_count(),
         median(forward_times), median(backward_times), min(forward_times), min(backward_times),
     )  # fmt: skip
     if backend == "cpu":
-        add_rates(row, found["projection"])
+        add_rates(row, projection)
     return row
 
 
@@ -233,11 +190,15 @@ def main() -> None:
     parser.add_argument(
         "--reference", action="store_true", help="time the dense reference too, where feasible"
     )
+    parser.add_argument("--against", metavar="COMMIT", help="compare the CPU backend with this commit's")
     parser.add_argument("--json", action="store_true", help="a row a line, and nothing else, on stdout")
     options = parser.parse_args()
     counts, sizes = options.n, [tuple(int(v) for v in size.split("x")) for size in options.sizes]
     if options.quick:
         counts, sizes = [100_000], [(640, 480)]
+    if options.against:
+        print(compare(options.against, counts, sizes, max(7, options.runs)))
+        return
     backends = options.backends or (["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
     rows = []
     for backend in backends:

@@ -83,7 +83,7 @@ def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = Non
     """
     workers = thread_count() if items is None else max(1, min(thread_count(), items))
     counter = np.zeros(1, np.int64)
-    if not getattr(kernel, "signatures", True):
+    if not getattr(kernel, "overloads", True):
         announce_compilation(kernel, counter, *arguments)
         return
     if workers == 1:
@@ -99,7 +99,7 @@ def launch(kernel: Callable[..., None], *arguments: Any, items: int | None = Non
 
 def run_once(kernel: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a short kernel on the calling thread only."""
-    if getattr(kernel, "signatures", True):
+    if getattr(kernel, "overloads", True):
         return kernel(*arguments)
     return announce_compilation(kernel, *arguments)
 
@@ -107,7 +107,7 @@ def run_once(kernel: Callable[..., Any], *arguments: Any) -> Any:
 def begin(kernel: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     """Starts a kernel in the background and returns a function that waits for its result."""
     workers = thread_count()
-    if workers == 1 or not getattr(kernel, "signatures", True):
+    if workers == 1 or not getattr(kernel, "overloads", True):
         result = run_once(kernel, *arguments)
         return lambda: result
     return _pool(os.getpid(), workers - 1).submit(kernel, *arguments).result

@@ -151,6 +151,15 @@ def test_needles(backend: str):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_saturated_pixels_beside_open_ones(backend: str):
+    """Lists of several batches in which some pixels of a block are saturated early and others late or never."""
+    case = random_case(600, 37, 29, size=0.03)
+    case.opacities[:] = 0.9 + 0.1 * case.opacities
+    case.means[:, 0] -= 0.5
+    assert_same(case, backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 17, 33])
 def test_counts_around_the_vector_width(backend: str, count: int):
     assert_same(random_case(count, 33, 20, size=0.2), backend)

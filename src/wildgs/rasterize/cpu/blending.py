@@ -12,6 +12,7 @@ from torch import Tensor
 from wildgs.rasterize.cpu import backward_kernels, forward_kernels, tile_kernels
 from wildgs.rasterize.cpu.projection import TileLists, scratch
 from wildgs.rasterize.cpu.reach_kernels import TILE
+from wildgs.rasterize.cpu.simd import LANES
 from wildgs.rasterize.interface import Projection, Rendering
 from wildgs.threads import flat, launch
 
@@ -35,20 +36,20 @@ class _Blend(torch.autograd.Function):
     ) -> Any:
         tiles: TileLists = projection.tiles
         pictures = _blend_pictures(projection, colors, background, with_depth, bookkeeping=True)
-        out_colors, out_depth, out_alpha, transmittance, last = pictures
-        ctx.save_for_backward(conics, depths, opacities, colors, background, out_depth, out_alpha)
+        out_colors, out_depth, out_alpha, ctx.values, ctx.masks, ctx.transmittance, ctx.last = pictures
+        ctx.save_for_backward(opacities, colors, background, out_depth, out_alpha)
         ctx.tiles, ctx.camera, ctx.absgrad = (tiles, projection.camera, projection.absgrad)
-        ctx.transmittance, ctx.last, ctx.with_depth = transmittance, last, with_depth
+        ctx.with_depth = with_depth
         return out_colors, out_depth, out_alpha
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         v_colors, v_depth, v_alpha = grads
-        conics, depths, opacities, colors, background, out_depth, out_alpha = ctx.saved_tensors
+        opacities, colors, background, out_depth, out_alpha = ctx.saved_tensors
         tiles: TileLists = ctx.tiles
         n, channels = colors.shape
-        # Rows are padded to whole SIMD vectors.
-        stride = -(-(backward_kernels.ROW_COLORS + channels) // 16) * 16
+        # Whole vectors: one for all sums, and further ones for colours that are not three.
+        stride = backward_kernels.ROW_COLORS + (0 if channels == 3 else -(-channels // LANES) * LANES)
         v_means2d, v_conics = torch.empty(n, 2), torch.empty(n, 3)
         v_opacities, v_depths, v_values = (torch.empty(n), torch.empty(n), torch.empty(n, channels))
         absgrad = None if ctx.absgrad is None else flat(ctx.absgrad)
@@ -56,13 +57,14 @@ class _Blend(torch.autograd.Function):
             launch(
                 backward_kernels.blend_backward,
                 tiles.tile_order, tiles.offsets, tiles.entries, tiles.records,
-                _rank_values(tiles, depths, colors), channels, ctx.with_depth, flat(background),
-                ctx.camera.width, ctx.camera.height, ctx.transmittance, ctx.last, flat(out_depth), flat(out_alpha),
-                flat(v_colors), flat(v_depth), flat(v_alpha), stride, rows, absgrad is not None,
+                ctx.values, channels, ctx.with_depth, flat(background),
+                ctx.camera.width, ctx.camera.height, ctx.masks, ctx.transmittance, ctx.last,
+                flat(out_depth), flat(out_alpha), flat(v_colors), flat(v_depth), flat(v_alpha),
+                stride, rows, absgrad is not None,
             )  # fmt: skip
             launch(
                 backward_kernels.sum_rows,
-                _CHUNK, tiles.ranks, tiles.starts, stride, rows, channels, flat(conics), flat(opacities),
+                _CHUNK, tiles.ranks, tiles.starts, stride, rows, channels, tiles.records, flat(opacities),
                 *map(flat, (v_means2d, v_conics, v_opacities, v_depths, v_values)), absgrad,
                 items=-(-n // _CHUNK),
             )  # fmt: skip
@@ -91,7 +93,11 @@ def _blend_pictures(
     bookkeeping: bool,
     order: np.ndarray | None = None,
 ) -> Any:
-    """Runs the forward kernel; returns colours, depth, alpha, final transmittance and last positions."""
+    """Runs the forward kernel.
+
+    Returns colours, depth and alpha, and for the backward pass values by rank, masks, final transmittance and last
+    positions.
+    """
     tiles: TileLists = projection.tiles
     width, height = projection.camera.width, projection.camera.height
     channels = colors.shape[1]
@@ -105,15 +111,16 @@ def _blend_pictures(
     size = (tiles.offsets.size - 1) * TILE * TILE
     transmittance = np.empty(size, np.float32) if bookkeeping else None
     last = np.empty(size, np.float32) if bookkeeping else None
+    masks = np.empty(tiles.pairs + LANES, np.int32)
     launch(
         forward_kernels.blend_forward,
         order, tiles.offsets, tiles.entries, tiles.records,
         values, channels, with_depth, flat(background),
-        width, height, flat(out_colors), flat(out_depth), flat(out_alpha), transmittance, last,
+        width, height, flat(out_colors), flat(out_depth), flat(out_alpha), masks, transmittance, last,
     )  # fmt: skip
     if not with_depth:
         out_depth = out_depth.expand(height, width)
-    return out_colors, out_depth, out_alpha, transmittance, last
+    return out_colors, out_depth, out_alpha, values, masks, transmittance, last
 
 
 def blend(

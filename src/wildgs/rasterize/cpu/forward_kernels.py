@@ -14,7 +14,7 @@ import numpy as np
 
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, ask_for_tile, close_tile, open_tile
-from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, REACH, RECORD, TILE, nearest_exponent
+from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, RECORD, TILE, reach
 from wildgs.rasterize.cpu.simd import (
     LANES,
     fma,
@@ -22,13 +22,14 @@ from wildgs.rasterize.cpu.simd import (
     lane_y,
     lowest_bit,
     mask_bits,
+    minus_magnitude,
     select,
     splat,
     vexp2,
     vmax,
     vmin,
 )
-from wildgs.rasterize.cpu.simd_memory import prefetch, vload, vstore
+from wildgs.rasterize.cpu.simd_memory import copy4, copy8, prefetch, vbits, vload, vspread, vstore
 from wildgs.threads import fetch_add
 
 PIXELS = TILE * TILE
@@ -36,15 +37,17 @@ PIXELS = TILE * TILE
 # whose sums stay in registers.
 BATCH = 64
 AHEAD = 16  # list entries between asking for a Gaussian's numbers and using them
-X, Y, QA, QB, QC, LEVEL, Y_PER_X, X_PER_Y, DEPTH, RED, GREEN, BLUE = tuple(range(0, 12 * BATCH, BATCH))
-FIELDS = 12
+# A Gaussian in a batch: its record (see `reach_kernels.RECORD`) with the tile's first pixel centre minus the
+# Gaussian's in place of its centre, depth and colours, then u and v at that pixel.
+FIELDS = 16
+X, Y, A, B, D, LEVEL, Y_PER_X, X_PER_Y, DEPTH, RED, GREEN, BLUE, U, V = range(14)
 MAX_ALPHA = np.float32(0.999)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 
 
 @njit(nogil=True)
-def load_batch(begin, count, entries, records, values, channels, tx, ty, batch):
-    """Copies the numbers of `count` Gaussians of a tile's list into rows of BATCH floats (see X to BLUE).
+def load_batch(begin, count, entries, records, values, channels, tx, ty, batch, masks):
+    """Copies `count` Gaussians of a tile's list into rows of `batch` and finds which blocks each reaches.
 
     They lie scattered in memory: they are asked for ahead of time.
     """
@@ -54,42 +57,38 @@ def load_batch(begin, count, entries, records, values, channels, tx, ty, batch):
         soon = entries[min(2 * (begin + i + AHEAD), entries.size - 2)]
         prefetch(records, soon * RECORD)
         prefetch(values, soon * row)
-        rank = entries[2 * (begin + i)]
-        r, v = rank * RECORD, rank * row
-        batch[X + i] = origin_x - records[r]
-        batch[Y + i] = origin_y - records[r + 1]
-        batch[QA + i], batch[QB + i], batch[QC + i] = (records[r + 2], records[r + 3], records[r + 4])
-        batch[LEVEL + i] = records[r + 5]
-        batch[Y_PER_X + i], batch[X_PER_Y + i] = records[r + 6], records[r + 7]
-        batch[DEPTH + i] = values[v]
+        rank, at = np.int64(entries[2 * (begin + i)]), i * FIELDS
+        copy8(batch, at, records, rank * RECORD)
         if channels == 3:
-            batch[RED + i], batch[GREEN + i], batch[BLUE + i] = (values[v + 1], values[v + 2], values[v + 3])
+            copy4(batch, at + DEPTH, values, rank * row)
+        else:
+            batch[at + DEPTH] = values[rank * row]
+        x, y = origin_x - batch[at + X], origin_y - batch[at + Y]
+        a, b, d = batch[at + A], batch[at + B], batch[at + D]
+        batch[at + U], batch[at + V] = a * x + b * y, d * y
+        masks[begin + i] = reach(
+            x, y, np.float32(4.0), a, b, d, batch[at + LEVEL], batch[at + Y_PER_X], batch[at + X_PER_Y]
+        )
 
 
 @njit(nogil=True)
-def reach_by_block(count, batch, words):
+def by_block(begin, count, masks, words):
     """For each block of the tile a word with a bit for every Gaussian of the batch that reaches it."""
     words[:] = 0
-    four, three = np.float32(4.0), np.float32(3.0)
     for group in range(0, count, LANES):
         valid = (1 << min(count - group, LANES)) - 1
-        x, y, level = (vload(batch, X + group), vload(batch, Y + group), vload(batch, LEVEL + group))
-        A, B, C = (vload(batch, QA + group), vload(batch, QB + group), vload(batch, QC + group))
-        y_per_x, x_per_y = vload(batch, Y_PER_X + group), vload(batch, X_PER_Y + group)
-        for row in range(4):
-            y0 = y + four * np.float32(row)
-            for column in range(4):
-                x0 = x + four * np.float32(column)
-                best = nearest_exponent(x0, y0, x0 + three, y0 + three, A, B, C, y_per_x, x_per_y)
-                words[row * 4 + column] |= (mask_bits(best + level >= REACH) & valid) << group
+        for block in range(16):
+            words[block] |= (mask_bits(vbits(masks, begin + group, block)) & valid) << group
 
 
 @njit(nogil=True)
 def blend_forward(
     counter, tile_order, offsets, entries, records, values, channels, with_depth, background,
-    width, height, out_colors, out_depth, out_alpha, final_transmittance, last,
+    width, height, out_colors, out_depth, out_alpha, masks, final_transmittance, last,
 ):  # fmt: skip
     """Blends all tiles.
+
+    `masks` takes for each pair a bit per block that the Gaussian reaches; it is LANES longer than there are pairs.
 
     `final_transmittance` and `last` (the last blended position in the tile's list, from 1) are laid out by tile
     and block for the backward pass; they are None where there will be none.
@@ -101,6 +100,9 @@ def blend_forward(
     patch = aligned(PATCH)
     batch = aligned(FIELDS * BATCH)
     words = np.empty(16, np.int64)
+    positions = aligned(BATCH)
+    for i in range(BATCH):
+        positions[i] = i + 1
     while True:
         item = fetch_add(counter, 1)
         if item >= tile_order.size:
@@ -118,8 +120,8 @@ def blend_forward(
             if alive == 0:
                 break
             count = min(BATCH, end - start)
-            load_batch(start, count, entries, records, values, channels, tx, ty, batch)
-            reach_by_block(count, batch, words)
+            load_batch(start, count, entries, records, values, channels, tx, ty, batch, masks)
+            by_block(start, count, masks, words)
             for block in range(16):
                 word = words[block]
                 if (alive >> block) & 1 == 0 or word == 0:
@@ -128,7 +130,7 @@ def blend_forward(
                 px = lane_x() + np.float32((block & 3) * 4)
                 py = lane_y() + np.float32((block >> 2) * 4)
                 before, total, depth = vload(sums, at), vload(sums, at + LANES), vload(sums, at + 2 * LANES)
-                hits = vload(reached, block * LANES)
+                hits = splat(0.0)
                 red, green, blue = splat(0.0), splat(0.0), splat(0.0)
                 if channels == 3:
                     red, green = vload(sums, at + 3 * LANES), vload(sums, at + 4 * LANES)
@@ -136,27 +138,26 @@ def blend_forward(
                 while word != 0:
                     i = lowest_bit(word)
                     word &= word - 1
-                    dx, dy = px + batch[X + i], py + batch[Y + i]
-                    exponent = fma(
-                        dx, fma(dx, batch[QA + i], dy * batch[QB + i]),
-                        fma(dy * batch[QC + i], dy, batch[LEVEL + i]),
-                    )  # fmt: skip
-                    hit = (exponent >= MIN_LEVEL) & (before > 0.0)
+                    g = i * FIELDS
+                    u = fma(px, vspread(batch, g + A), fma(py, vspread(batch, g + B), vspread(batch, g + U)))
+                    v = fma(py, vspread(batch, g + D), vspread(batch, g + V))
+                    exponent = fma(-u, u, fma(-v, v, vspread(batch, g + LEVEL)))
                     alpha = vmin(vexp2(exponent), MAX_ALPHA)
-                    weight = before * alpha
-                    after = before - weight
+                    after = fma(-before, alpha, before)
+                    hit = exponent >= MIN_LEVEL
                     kept = hit & (after > MIN_TRANSMITTANCE)
-                    weight = select(kept, weight, 0.0)
+                    weight = select(kept, before * alpha, 0.0)
                     total = total + weight
-                    before = select(kept, after, select(hit, -before, before))
+                    # Below 0 where saturated: `after` is then below 0, too, and nothing is kept.
+                    before = select(kept, after, select(hit, minus_magnitude(before), before))
                     if last is not None:
-                        hits = select(kept, splat(np.float32(start - begin + i + 1)), hits)
+                        hits = select(kept, vspread(positions, i), hits)
                     if with_depth:
-                        depth = fma(weight, batch[DEPTH + i], depth)
+                        depth = fma(weight, vspread(batch, g + DEPTH), depth)
                     if channels == 3:
-                        red = fma(weight, batch[RED + i], red)
-                        green = fma(weight, batch[GREEN + i], green)
-                        blue = fma(weight, batch[BLUE + i], blue)
+                        red = fma(weight, vspread(batch, g + RED), red)
+                        green = fma(weight, vspread(batch, g + GREEN), green)
+                        blue = fma(weight, vspread(batch, g + BLUE), blue)
                     else:
                         first = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
@@ -165,7 +166,9 @@ def blend_forward(
                 vstore(sums, at, before)
                 vstore(sums, at + LANES, total)
                 vstore(sums, at + 2 * LANES, depth)
-                vstore(reached, block * LANES, hits)
+                if last is not None:
+                    hits = select(hits > 0.0, hits + np.float32(start - begin), vload(reached, block * LANES))
+                    vstore(reached, block * LANES, hits)
                 if channels == 3:
                     vstore(sums, at + 3 * LANES, red)
                     vstore(sums, at + 4 * LANES, green)

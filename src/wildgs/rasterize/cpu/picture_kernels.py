@@ -21,7 +21,7 @@ def aligned(size):
     return raw[skip : skip + size]
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def put_rows(patch, per_pixel, picture, x, y, width, height):
     """Writes a block's pixels, row after row in `patch`, to the picture at (x, y), cut at its border."""
     row, count = 4 * per_pixel, min(4, width - x) * per_pixel
@@ -35,7 +35,7 @@ def put_rows(patch, per_pixel, picture, x, y, width, height):
                 picture[at + k] = patch[line * row + k]
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def get_rows(patch, per_pixel, picture, x, y, width, height):
     """Reads a block's pixels from the picture; 0 beyond its border."""
     row, count = 4 * per_pixel, min(4, width - x) * per_pixel

@@ -22,10 +22,10 @@ from wildgs.rasterize.cpu.reach_kernels import (
     RECORD,
     count_bits,
     inside_bits,
-    nearest_exponent,
+    least_falloff,
     window_mask,
 )
-from wildgs.rasterize.cpu.simd import mask_bits, select, splat, vfloor, vlog2, vmax, vmin, vsqrt
+from wildgs.rasterize.cpu.simd import lowest_bit, mask_bits, select, splat, vfloor, vlog2, vmax, vmin, vsqrt
 from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore2, vstore3, vstore8
 from wildgs.threads import fetch_add
 
@@ -49,30 +49,32 @@ def project_forward(
             break
         for group in range(first, min(first + CHUNK, groups)):
             i = min(group * GROUP, n - GROUP)
-            corners = project_group(
+            large = project_group(
                 i, means, quats, scales, opacities, view, lens, width, height, near,
                 means2d, depths, conics, records, spans,
             )  # fmt: skip
-            nn, fn, nf, ff, small = corners
             for lane in range(GROUP):
                 g = i + lane
-                radius = np.int32(spans[lane])
-                radii[g] = radius
-                mask, count = 0, 0
-                if radius > 0:
-                    x0, y0 = int(spans[GROUP + lane]), int(spans[2 * GROUP + lane])
-                    x1, y1 = int(spans[3 * GROUP + lane]), int(spans[4 * GROUP + lane])
-                    boxes[g] = pack_box(x0, y0, x1, y1)
-                    if (small >> lane) & 1 != 0:
-                        a, b, c, d = (nn >> lane) & 1, (fn >> lane) & 1, (nf >> lane) & 1, (ff >> lane) & 1
-                        mask, count = a | (b << 1) | (c << 4) | (d << 5), a + b + c + d
-                    else:
-                        mask, count = find_tiles(g, x0, y0, x1, y1, records)
-                masks[g] = mask
-                tile_counts[g] = count
+                radii[g] = np.int32(spans[lane])
+                boxes[g] = pack_box(
+                    np.int64(spans[GROUP + lane]), np.int64(spans[2 * GROUP + lane]),
+                    np.int64(spans[3 * GROUP + lane]), np.int64(spans[4 * GROUP + lane]),
+                )  # fmt: skip
+                masks[g], tile_counts[g] = (
+                    np.int32(spans[5 * GROUP + lane]),
+                    np.int32(spans[6 * GROUP + lane]),
+                )
+            while large != 0:
+                lane = lowest_bit(large)
+                large &= large - 1
+                g = i + lane
+                masks[g], tile_counts[g] = find_tiles(
+                    g, np.int64(spans[GROUP + lane]), np.int64(spans[2 * GROUP + lane]),
+                    np.int64(spans[3 * GROUP + lane]), np.int64(spans[4 * GROUP + lane]), records,
+                )  # fmt: skip
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def pack_box(x0, y0, x1, y1):
     """First and last column and row of tiles in one number, so that it is moved at once."""
     return x0 | (y0 << 16) | (x1 << 32) | (y1 << 48)
@@ -97,9 +99,8 @@ def project_group(
 ):  # fmt: skip
     """Sixteen Gaussians from index i.
 
-    `spans` takes radii and the boxes' first and last tiles. Returns, for the box's first tile, the one to its
-    right, the one below and the one beyond both, a bit per Gaussian that reaches it; and a bit per Gaussian whose
-    box has no more tiles than these.
+    `spans` takes radii, the boxes' first and last tiles, and masks and numbers of tiles where the box has at most
+    2 x 2 tiles. Returns a bit per Gaussian whose box has more.
     """
     R = camera_numbers(view)
     px, py, pz = vload3(means, 3 * i)
@@ -136,10 +137,14 @@ def project_group(
     radius = vmin(-vfloor(-vmax(hx, hy)), 1e9)
     vstore(spans, 0, select(seen, vmax(radius, 1.0), zero))
     if mask_bits(seen) == 0:
-        return 0, 0, 0, 0, 0
-    A, B, C = -0.5 * LOG2_E * conic_a, -LOG2_E * conic_b, -0.5 * LOG2_E * conic_c
+        for k in range(GROUP, 7 * GROUP, GROUP):
+            vstore(spans, k, zero)
+        return 0
+    # The conic's Cholesky factor from the covariance: d^2 as a difference of conics would lose a needle's digits.
     y_per_x, x_per_y = b / a, b / c
-    vstore8(records, RECORD * i, (mx, my, A, B, C, level, y_per_x, x_per_y))
+    factor_a, factor_d = vsqrt(0.5 * LOG2_E * select(sound, conic_a, 1.0)), vsqrt(0.5 * LOG2_E / c)
+    factor_b = -x_per_y * factor_a
+    vstore8(records, RECORD * i, (mx, my, factor_a, factor_b, factor_d, level, y_per_x, x_per_y))
 
     # Pixels whose centres lie in the ellipse's box, then their tiles; there may be no such pixel.
     left, top = -vfloor(-vmax(mx - hx - 0.5, 0.0)), -vfloor(-vmax(my - hy - 0.5, 0.0))
@@ -152,17 +157,19 @@ def project_group(
     vstore(spans, 3 * GROUP, x1)
     vstore(spans, 4 * GROUP, y1)
     left, top = x0 * 16.0 + 0.5 - mx, y0 * 16.0 + 0.5 - my
-    floor = REACH - level
+    factor = (factor_a, factor_b, factor_d, y_per_x, x_per_y)
+    limit = level - REACH
     near_x, near_y, far_x, far_y = left + 15.0, top + 15.0, left + 31.0, top + 31.0
-    nn = nearest_exponent(left, top, near_x, near_y, A, B, C, y_per_x, x_per_y)
-    fn = nearest_exponent(left + 16.0, top, far_x, near_y, A, B, C, y_per_x, x_per_y)
-    nf = nearest_exponent(left, top + 16.0, near_x, far_y, A, B, C, y_per_x, x_per_y)
-    ff = nearest_exponent(left + 16.0, top + 16.0, far_x, far_y, A, B, C, y_per_x, x_per_y)
+    nn = least_falloff(left, top, near_x, near_y, *factor)
+    fn = least_falloff(left + 16.0, top, far_x, near_y, *factor)
+    nf = least_falloff(left, top + 16.0, near_x, far_y, *factor)
+    ff = least_falloff(left + 16.0, top + 16.0, far_x, far_y, *factor)
     wide, tall = seen & (x1 > x0), seen & (y1 > y0)
-    return (
-        mask_bits(seen & (nn >= floor)),
-        mask_bits(wide & (fn >= floor)),
-        mask_bits(tall & (nf >= floor)),
-        mask_bits(wide & tall & (ff >= floor)),
-        mask_bits((x1 - x0 < 2.0) & (y1 - y0 < 2.0)),
+    nn, fn = select(seen & (nn <= limit), splat(1.0), zero), select(wide & (fn <= limit), splat(1.0), zero)
+    nf, ff = (
+        select(tall & (nf <= limit), splat(1.0), zero),
+        select(wide & tall & (ff <= limit), splat(1.0), zero),
     )
+    vstore(spans, 5 * GROUP, nn + 2.0 * fn + 16.0 * nf + 32.0 * ff)
+    vstore(spans, 6 * GROUP, nn + fn + nf + ff)
+    return mask_bits(seen & ((x1 - x0 >= 2.0) | (y1 - y0 >= 2.0)))

@@ -208,11 +208,11 @@ def _list_tiles(
     n = tile_counts.size
     seen = int(np.count_nonzero(tile_counts))
     ranks, homes = np.empty(n, np.int32), np.empty(seen, np.int32)
-    ranked_records, starts = (np.empty(seen * RECORD, np.float32), np.empty(seen + 1, np.int64))
+    ranked_records, starts = _aligned(seen * RECORD, np.float32), np.empty(seen + 1, np.int64)
     offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
     chunks = max(1, min(2 * thread_count(), n // 1024))
     with (
-        scratch("cursors", chunks * tiles_x * tiles_y, np.int64) as counts,
+        scratch("cursors", chunks * (tiles_x * tiles_y + tiles_x + 2), np.int64) as counts,
         scratch("spans", 4 * seen, np.int32) as spans,
         scratch("keys", 2 * seen, np.uint32) as keys,
         scratch("order", 2 * seen, np.int32) as order,
@@ -239,11 +239,11 @@ def _list_tiles(
         pairs = numbered()
         if pairs >= 2**31:
             raise UserError(f"too many pairs of tile and Gaussian ({pairs:,}); render at a lower resolution")
-        entries = np.empty(2 * pairs, np.int32)
+        entries = np.empty(2 * pairs + 2, np.int32)
         launch(
             tile_kernels.write_pairs, nearest, spans, ranked_records, starts, tiles_x, cursors, entries,
             items=chunks,
         )  # fmt: skip
     # Sorted by powers of two of the length: tiles of similar length keep their order, for cache locality.
     tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
-    return TileLists(ranks, homes, ranked_records, starts, offsets, entries, tile_order)
+    return TileLists(ranks, homes, ranked_records, starts, offsets, entries[:-2], tile_order)

@@ -11,7 +11,9 @@ from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.simd import fma, lane_x, lane_y, mask_bits, vmax, vmin
 from wildgs.rasterize.interface import TILE
 
-# Floats per Gaussian: x, y, A, B, C, level, -B / 2C, -B / 2A, with log2 alpha = A dx^2 + B dx dy + C dy^2 + level.
+# Floats per Gaussian: x, y, a, b, d, level, y_per_x, x_per_y, with log2 alpha = level - u^2 - v^2, u = a dx + b dy
+# and v = d dy (the Cholesky factor of the conic): fewer operations than dx^2, dx dy and dy^2, and a needle's
+# exponent is no difference of large numbers. y_per_x = -a b / (b^2 + d^2) and x_per_y = -b / a.
 RECORD = 8
 MIN_LEVEL = np.float32(-7.99435344)  # log2(1/255)
 REACH = np.float32(-7.99435344 - 0.01)
@@ -19,23 +21,24 @@ HALF = np.float32(0.5)
 
 
 @njit(nogil=True)
-def nearest_exponent(x0, y0, x1, y1, A, B, C, y_per_x, x_per_y):
-    """Largest value of A x^2 + B x y + C y^2 (negative definite) in the rectangle from (x0, y0) to (x1, y1).
+def least_falloff(x0, y0, x1, y1, a, b, d, y_per_x, x_per_y):
+    """Smallest value of (a x + b y)^2 + (d y)^2 in the rectangle from (x0, y0) to (x1, y1).
 
-    It lies on the edge that faces the centre, horizontal or vertical. `y_per_x` is -B / 2C: where along a column
-    the value is largest; `x_per_y` likewise.
+    It lies on the edge that faces the centre, horizontal or vertical. Along a column the value is smallest at
+    y = x * y_per_x, along a row at x = y * x_per_y.
     """
     edge_x = vmin(vmax(x0, 0.0), x1)
     edge_y = vmin(vmax(y0, 0.0), y1)
     best_y = vmin(vmax(edge_x * y_per_x, y0), y1)
     best_x = vmin(vmax(edge_y * x_per_y, x0), x1)
-    vertical = fma(edge_x, fma(A, edge_x, B * best_y), C * best_y * best_y)
-    horizontal = fma(best_x, fma(A, best_x, B * edge_y), C * edge_y * edge_y)
-    return vmax(vertical, horizontal)
+    u, v = fma(a, edge_x, b * best_y), d * best_y
+    vertical = fma(u, u, v * v)
+    u, v = fma(a, best_x, b * edge_y), d * edge_y
+    return vmin(vertical, fma(u, u, v * v))
 
 
 @njit(nogil=True)
-def reach(x, y, side, A, B, C, level, y_per_x, x_per_y):
+def reach(x, y, side, a, b, d, level, y_per_x, x_per_y):
     """Which squares of a 4 x 4 arrangement a Gaussian reaches, as 16 bits.
 
     (x, y) is the centre of the arrangement's first pixel minus the Gaussian's, `side` the length of a square, in
@@ -44,8 +47,8 @@ def reach(x, y, side, A, B, C, level, y_per_x, x_per_y):
     x0 = lane_x() * side + x
     y0 = lane_y() * side + y
     more = side - np.float32(1.0)
-    best = nearest_exponent(x0, y0, x0 + more, y0 + more, A, B, C, y_per_x, x_per_y)
-    return mask_bits(best + level >= REACH)
+    least = least_falloff(x0, y0, x0 + more, y0 + more, a, b, d, y_per_x, x_per_y)
+    return mask_bits(least <= level - REACH)
 
 
 @njit(nogil=True)

@@ -8,7 +8,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from wildgs.rasterize.cpu.simd import INT_VECTOR, LANES, VECTOR, VECTOR_IR
+from wildgs.rasterize.cpu.simd import INT_VECTOR, LANES, MASK, VECTOR, VECTOR_IR, splat_ir
 
 
 def _element_pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, offset: Any) -> ir.Value:
@@ -47,6 +47,67 @@ def vstore(typingctx, array, offset, value):
         return context.get_dummy_value()
 
     return types.void(array, offset, value), codegen
+
+
+@intrinsic
+def vspread(typingctx, array, offset):
+    """The flat element `offset` of a C-contiguous float32 array in every lane; `offset` is not negative."""
+    if not (_flat_float_array(array) and isinstance(offset, types.Integer)):
+        return None
+
+    def codegen(context, builder, sig, args):
+        offset = context.cast(builder, args[1], sig.args[1], types.intp)
+        return splat_ir(
+            builder, builder.load(_element_pointer(context, builder, sig.args[0], args[0], offset))
+        )
+
+    return VECTOR(array, offset), codegen
+
+
+@intrinsic
+def vbits(typingctx, array, offset, bit):
+    """Of sixteen numbers of a C-contiguous int32 array, from flat element `offset` on: which have bit `bit` set."""
+    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.int32):
+        return None
+
+    def codegen(context, builder, sig, args):
+        offset, bit = (context.cast(builder, args[i], sig.args[i], types.intp) for i in (1, 2))
+        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+        numbers = builder.load(builder.bitcast(pointer, INT_VECTOR.as_pointer()), align=4)
+        one = builder.trunc(builder.shl(ir.Constant(ir.IntType(64), 1), bit), ir.IntType(32))
+        wanted = builder.insert_element(
+            ir.Constant(INT_VECTOR, ir.Undefined), one, ir.Constant(ir.IntType(32), 0)
+        )
+        wanted = builder.shuffle_vector(
+            wanted, ir.Constant(INT_VECTOR, ir.Undefined), ir.Constant(INT_VECTOR, [0] * LANES)
+        )
+        return builder.icmp_signed("!=", builder.and_(numbers, wanted), ir.Constant(INT_VECTOR, [0] * LANES))
+
+    return MASK(array, offset, bit), codegen
+
+
+def _copier(count: int) -> Any:
+    def typing(typingctx, to, to_offset, source, offset):
+        if not (_flat_float_array(to) and _flat_float_array(source)):
+            return None
+        kind = ir.VectorType(ir.FloatType(), count).as_pointer()
+
+        def codegen(context, builder, sig, args):
+            places = []
+            for i in (0, 2):
+                offset = context.cast(builder, args[i + 1], sig.args[i + 1], types.intp)
+                place = _element_pointer(context, builder, sig.args[i], args[i], offset)
+                places.append(builder.bitcast(place, kind))
+            builder.store(builder.load(places[1], align=4), places[0], align=4)
+            return context.get_dummy_value()
+
+        return types.void(to, to_offset, source, offset), codegen
+
+    return intrinsic(typing)
+
+
+# Moves 4 or 8 floats between C-contiguous float32 arrays: (to, flat element there, source, flat element there).
+copy4, copy8 = _copier(4), _copier(8)
 
 
 def _prefetcher(to_write: int) -> Any:

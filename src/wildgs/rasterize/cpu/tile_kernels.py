@@ -15,14 +15,15 @@ import numpy as np
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.reach_kernels import RECORD, inside_bits, window_mask
 from wildgs.rasterize.cpu.simd import lowest_bit
-from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write
+from wildgs.rasterize.cpu.simd_memory import copy8, prefetch, prefetch_to_write
 from wildgs.threads import fetch_add
 
 AHEAD = 16  # items between asking for what an item needs and using it
+SMALL = 0x33  # the bits of a window's first 2 x 2 tiles, all that most Gaussians reach
 DIGIT = 12  # bits per radix pass, so that the counts stay in the fastest cache
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def home_tile(box, tiles_x):
     """The tile in which a box (see `project_kernels.pack_box`) starts."""
     return ((box >> 16) & 0xFFFF) * tiles_x + (box & 0xFFFF)
@@ -46,14 +47,14 @@ def count_homes(counter, tile_counts, boxes, tiles_x, cursors):
 @njit(nogil=True)
 def place_chunks(cursors, offsets):
     """Turns counts per (chunk, tile) into first positions, tile by tile and chunk by chunk."""
-    at = 0
-    for tile in range(cursors.shape[1]):
+    at, tiles = 0, offsets.size - 1
+    for tile in range(tiles):
         offsets[tile] = at
         for chunk in range(cursors.shape[0]):
             count = cursors[chunk, tile]
             cursors[chunk, tile] = at
             at += count
-    offsets[cursors.shape[1]] = at
+    offsets[tiles] = at
 
 
 @njit(nogil=True)
@@ -84,8 +85,7 @@ def move_home(
                 rank = ranks[g]
                 if rank >= 0:
                     homes[rank] = g
-                    for k in range(RECORD):
-                        ranked_records[RECORD * rank + k] = records[RECORD * g + k]
+                    copy8(ranked_records, RECORD * rank, records, RECORD * g)
                     spans[4 * rank], spans[4 * rank + 1] = np.int32(boxes[g]), np.int32(boxes[g] >> 32)
                     spans[4 * rank + 2] = masks[g]
                     spans[4 * rank + 3] = tile_counts[g]
@@ -152,7 +152,11 @@ def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
 
 @njit(nogil=True)
 def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors):
-    """Pairs per (chunk of the depth order, tile), into `cursors`; the order as ranks, into `nearest`."""
+    """Pairs per (chunk of the depth order, tile), into `cursors`; the order as ranks, into `nearest`.
+
+    Rows of `cursors` have tiles_x + 2 numbers more than there are tiles: a small box adds 0 to tiles that it does
+    not reach, as a loop over those that it does is mispredicted at most Gaussians.
+    """
     chunks, count = cursors.shape[0], order.size
     while True:
         chunk = fetch_add(counter, 1)
@@ -167,8 +171,14 @@ def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors
             nearest[i] = rank
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
             bits = int(spans[4 * rank + 2])
+            first = y0 * tiles_x + x0
+            if bits & ~SMALL == 0:
+                row[first] += bits & 1
+                row[first + 1] += (bits >> 1) & 1
+                row[first + tiles_x] += (bits >> 4) & 1
+                row[first + tiles_x + 1] += bits >> 5
+                continue
             if bits >= 0:
-                first = y0 * tiles_x + x0
                 while bits != 0:
                     b = lowest_bit(bits)
                     bits &= bits - 1
@@ -186,7 +196,8 @@ def count_pairs(counter, order, ranks, nearest, spans, records, tiles_x, cursors
 
 @njit(nogil=True)
 def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entries):
-    """Writes each pair's rank and slot, tile by tile, nearest first."""
+    """Writes each pair's rank and slot, tile by tile, nearest first; after the last there is room for one more."""
+    spare = entries.size // 2 - 1
     chunks, count = cursors.shape[0], nearest.size
     while True:
         chunk = fetch_add(counter, 1)
@@ -194,15 +205,27 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
             break
         row = cursors[chunk]
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
-            soon = nearest[min(i + AHEAD, count - 1)]
+            soon = nearest[min(i + 2 * AHEAD, count - 1)]
             prefetch(spans, 4 * soon)
             prefetch(starts, soon)
+            soon = 4 * np.int64(nearest[min(i + AHEAD, count - 1)])
+            first = (spans[soon] >> 16) * tiles_x + (spans[soon] & 0xFFFF)
+            # The places of most of its pairs; asking for the right ones alone would take branches.
+            prefetch_to_write(entries, 2 * row[first])
+            prefetch_to_write(entries, 2 * row[first + 1])
+            prefetch_to_write(entries, 2 * row[first + tiles_x])
             rank = nearest[i]
             slot = starts[rank]
             x0, y0 = spans[4 * rank] & 0xFFFF, spans[4 * rank] >> 16
-            bits = int(spans[4 * rank + 2])
+            bits, first = int(spans[4 * rank + 2]), y0 * tiles_x + x0
+            if bits & ~SMALL == 0:
+                slot = write_or_spare(bits & 1, first, rank, slot, row, entries, spare)
+                slot = write_or_spare((bits >> 1) & 1, first + 1, rank, slot, row, entries, spare)
+                slot = write_or_spare((bits >> 4) & 1, first + tiles_x, rank, slot, row, entries, spare)
+                write_or_spare(bits >> 5, first + tiles_x + 1, rank, slot, row, entries, spare)
+                continue
             if bits >= 0:
-                write_window(bits, y0 * tiles_x + x0, tiles_x, rank, slot, row, entries)
+                write_window(bits, first, tiles_x, rank, slot, row, entries)
                 continue
             x1, y1 = spans[4 * rank + 1] & 0xFFFF, spans[4 * rank + 1] >> 16
             for ty in range(y0, y1 + 1, 4):
@@ -211,7 +234,18 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
                     slot = write_window(bits, ty * tiles_x + tx, tiles_x, rank, slot, row, entries)
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
+def write_or_spare(bit, tile, rank, slot, row, entries, spare):
+    """Writes a pair to the tile's list if `bit` is 1, else where nobody reads; without a branch. The next slot."""
+    at = row[tile]
+    row[tile] = at + bit
+    to = at if bit != 0 else spare
+    entries[2 * to] = rank
+    entries[2 * to + 1] = slot
+    return slot + bit
+
+
+@njit(nogil=True)
 def write_window(bits, first, tiles_x, rank, slot, row, entries):
     """Writes a pair for each tile of a window of 4 x 4 whose bit is set; returns the next slot."""
     while bits != 0:

@@ -1,0 +1,73 @@
+"""The vector layer under the CPU kernels, against NumPy in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wildgs.kernel_cache import njit
+from wildgs.rasterize.cpu.simd import (
+    LANES,
+    SUM_LANES,
+    lane_sums,
+    mask_bits,
+    minus_magnitude,
+    vexp2,
+    vratio,
+)
+from wildgs.rasterize.cpu.simd_memory import copy4, copy8, vbits, vload, vspread, vstore
+
+
+@njit(nogil=True)
+def each(x, y, powers, ratios, negated):
+    for i in range(0, x.size, LANES):
+        vstore(powers, i, vexp2(vload(x, i)))
+        vstore(ratios, i, vratio(vload(y, i), 1.0 - vload(y, i)))
+        vstore(negated, i, minus_magnitude(vload(x, i)))
+
+
+@njit(nogil=True)
+def sums(x, out):
+    a, b, c, d, e = vload(x, 0), vload(x, 16), vload(x, 32), vload(x, 48), vload(x, 64)
+    f, g, h, i, j = vload(x, 80), vload(x, 96), vload(x, 112), vload(x, 128), vload(x, 144)
+    vstore(out, 0, lane_sums((a, b, c, d, e, f, g, h, i, j)))
+    vstore(out, 16, lane_sums((a, b, c, d, e, f, g, h, i, j, vload(x, 160), vload(x, 176))))
+
+
+@njit(nogil=True)
+def moves(numbers, masks, out):
+    copy8(out, 1, numbers, 3)
+    copy4(out, 9, numbers, 20)
+    vstore(out, 16, vspread(numbers, 5))
+    return mask_bits(vbits(masks, 2, 15)), mask_bits(vbits(masks, 2, 0))
+
+
+def test_exponentials_and_ratios_to_the_last_bits():
+    x = np.concatenate([np.linspace(-125, 0, 99_991), [-0.5, -1.5, -2.5, -7.0, -0.0]]).astype(np.float32)
+    x = np.resize(x, -(-len(x) // LANES) * LANES)
+    y = np.linspace(0, 0.999, len(x)).astype(np.float32)
+    powers, ratios, negated = np.empty_like(x), np.empty_like(x), np.empty_like(x)
+    each(x, y, powers, ratios, negated)
+    assert np.abs(powers / np.exp2(x.astype(np.float64)) - 1).max() < 3e-7
+    exact = y / (np.float32(1) - y).astype(np.float64)
+    assert np.abs(ratios - exact).max() / exact.max() < 3e-7
+    assert (np.abs(ratios - exact) <= 3e-7 * exact).all()
+    assert np.array_equal(negated, x)
+    assert np.signbit(negated).all()
+
+
+@pytest.mark.parametrize("count", [10, 12])
+def test_sums_stand_in_their_lanes(count: int):
+    x = np.random.default_rng(0).random(12 * LANES, np.float32)
+    out = np.zeros(2 * LANES, np.float32)
+    sums(x, out)
+    found = out[:LANES] if count == 10 else out[LANES:]
+    expected = x.reshape(12, LANES).sum(1, dtype=np.float64)[:count]
+    assert np.allclose(found[list(SUM_LANES[:count])], expected, rtol=1e-6)
+
+
+def test_moves_and_bits():
+    numbers, out = np.arange(32, dtype=np.float32), np.zeros(32, np.float32)
+    masks = np.array([0, 0, *(0x8001, 0x8000, 1, 0) * 4], np.int32)
+    assert moves(numbers, masks, out) == (0x3333, 0x5555)
+    assert out.tolist() == [0, *range(3, 11), *range(20, 24), 0, 0, 0, *[5] * 16]
