@@ -31,7 +31,7 @@ class ObjectiveConfig:
     weight_l1: float = 0.8
     mask_weight_start: float = 0.4
     mask_weight_end: float = 0.1
-    mask_weight_photos: int = 90
+    mask_weight_photos: int = 70
     mask_power: float = 3.0
     depth_weight: float = 0.01
     metric_weight: float = 0.1
