@@ -155,7 +155,7 @@ def test_phototourism_as_distributed_beside_the_papers_figures(
     text = (output / "table.md").read_text(encoding="utf-8")
     assert "| CR-NeRF |" in text
     assert "RTX 3090" in text
-    assert "All lines but other presets: preset paper." in text
+    assert "Preset of all rows except other presets: paper." in text
 
 
 @pytest.mark.parametrize(

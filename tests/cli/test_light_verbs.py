@@ -130,7 +130,7 @@ MISTAKES = {
     "still of nothing": (("render", "{run}", "--path", "still", "--output", "{tmp}/o.mp4"), "one photo"),
     "bad weights": (
         ("render", "{run}", "--appearance", "{a}", "{b}", "--weights", "1", "1", "--output", "{tmp}/o"),
-        "add up to 2",
+        "must add up to 1, not to 2",
     ),
     "bad ending": (("appearance", "{run}", "{a}", "--output", "{tmp}/o.pt"), "safetensors"),
     "two in one": (("appearance", "{run}", "{a}", "{b}", "--output", "{tmp}/o.safetensors"), "--weights"),

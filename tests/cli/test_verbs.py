@@ -80,7 +80,7 @@ def test_demo_ends_with_a_page(
 
 
 MISTAKES = {
-    "unknown verb": (("fly",), "no verb 'fly'"),
+    "unknown verb": (("fly",), "unknown verb 'fly'"),
     "scene missing": (("train", "{tmp}/nowhere", "--output", "{tmp}/run"), "nowhere"),
     "not a run": (("eval", "{tmp}"), "not a run folder"),
     "run exists": (("train", "{landmark}", "--output", "{trained}"), "already holds a run"),

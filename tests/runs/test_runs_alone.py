@@ -137,7 +137,7 @@ def test_a_changed_scene_changes_no_camera_and_is_said(trained: Path, landmark: 
     run = load_run(trained, CPU)
     with (
         pytest.warns(WildGSWarning, match="split.tsv names 2 photos"),
-        pytest.warns(WildGSWarning, match=r"has changed since.*2 photos gone"),
+        pytest.warns(WildGSWarning, match=r"has changed since.*2 photos missing"),
     ):
         now = run.read_scene(changed)
     before = {view.name: view for view in run.read_scene().views}

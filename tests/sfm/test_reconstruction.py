@@ -102,7 +102,7 @@ def test_photos_of_every_kind_become_a_scene(tmp_path: Path, corner: Corner) -> 
     assert report.pictures == {}  # a blank photo matches none
     left_out = {photo.name: photo for photo in read_left_out(tmp_path / "scene")}
     assert left_out["blank.jpg"].picture is None
-    assert "7 photos have a pose, 0 of them by a second" in describe_placed(tmp_path / "scene")
+    assert "7 photos have a pose, 0 of them by the second" in describe_placed(tmp_path / "scene")
     assert ("reading photos", 9, 9) in steps
     assert steps[-1][0] == "undistorting"
     assert any("blank.jpg" in line for line in report.lines())
@@ -179,7 +179,7 @@ def test_names_that_phones_and_old_disks_write(tmp_path: Path, corner: Corner) -
         path = tmp_path / "p" / os.fsdecode(name)
         Image.fromarray(pixels).save(path, "JPEG", quality=95)
     (tmp_path / "p" / os.fsdecode(b"br\xffken.jpg")).write_bytes(b"no photo")
-    with pytest.warns(WildGSWarning, match=r"br\\xffken\.jpg: not a readable picture"):
+    with pytest.warns(WildGSWarning, match=r"br\\xffken\.jpg: not a readable image"):
         report = reconstruct(tmp_path / "p", tmp_path / os.fsdecode(b"sc\xe8ne"))
     expected = ("2023-07-14 18:22:31.jpg", "IMG_7.jpg", "caf_.jpg", "line_break.jpg")
     assert report.registered == expected

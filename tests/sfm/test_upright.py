@@ -37,7 +37,7 @@ def test_hidden_files_and_other_files_are_no_photos(tmp_path: Path) -> None:
     for name in ("b.JPG", "a.png", ".hidden.jpg", "notes.txt", "sub/c.jpeg", ".git/d.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    with pytest.warns(WildGSWarning, match=r"1 files are not photos by their names .*: notes\.txt"):
+    with pytest.warns(WildGSWarning, match=r"1 files are not photos by their extension .*: notes\.txt"):
         assert list_photos(tmp_path) == ["a.png", "b.JPG", "sub/c.jpeg"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="no photos"):

@@ -67,7 +67,7 @@ def test_videos_are_bounded(panel: RecordingPanel, wall: Scene, seconds: float, 
     for view in wall.views[:2]:
         panel.add(pose_of(view.camera))
     panel._seconds._impl.value, panel._height._impl.value = seconds, height
-    with pytest.raises(UserError, match="up to 60 seconds"):
+    with pytest.raises(UserError, match="limited to 60 seconds"):
         panel.order()
 
 
@@ -111,6 +111,6 @@ def test_closing_the_viewer_leaves_no_half_video(
         panel.add(pose_of(view.camera))
     panel._height.value = "360"
     desk = LightDesk(Light("0 dark.jpg", "dark"), Light("1 bright.jpg", "bright"))
-    with pytest.raises(UserError, match="not finished"):
+    with pytest.raises(UserError, match="incomplete"):
         make_film(subject, desk, panel.order(), tmp_path / "a.mp4", lambda done, _: done < 3)
     assert list(tmp_path.iterdir()) == []

@@ -102,8 +102,8 @@ def test_a_picture_that_cannot_be_used_never_reaches_all_of_its_bytes(
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (begin(size=MAX_BYTES + 1), "up to 64 MB"),
-        (begin(parts=10**9), "up to 64 MB"),
+        (begin(size=MAX_BYTES + 1), "limited to 64 MB"),
+        (begin(parts=10**9), "limited to 64 MB"),
         (begin(size=0, parts=0), "empty"),
         (begin(size=5, parts=0), "empty"),
     ],
@@ -138,7 +138,7 @@ def test_nonsense_is_ignored(uploads: Uploads, replies: Replies, message) -> Non
 def test_parts_that_do_not_fit_end_the_upload(uploads: Uploads, replies: Replies, wrong) -> None:
     uploads.start("me", begin())
     uploads.part("me", wrong)
-    assert "damaged" in replies.said[-1][1]
+    assert "corrupted" in replies.said[-1][1]
     assert uploads._open == {}
 
 
@@ -146,7 +146,7 @@ def test_too_few_bytes_are_a_failure(uploads: Uploads, replies: Replies, taken) 
     uploads.start("me", begin(parts=1))
     uploads.part("me", part(0, b"0"))
     assert replies.done.wait(20)
-    assert "damaged" in replies.said[-1][1]
+    assert "corrupted" in replies.said[-1][1]
     assert taken == []
 
 

@@ -114,7 +114,7 @@ def test_a_method_without_masks_says_so(
 ) -> None:
     complaints: list[str] = []
     monkeypatch.setattr(subject, "visibility", lambda view: None)
-    monkeypatch.setattr(viewer, "complain", complaints.append)
+    monkeypatch.setattr(viewer, "show_error", complaints.append)
     viewer.lighting.masks.value = True
     viewer._masks_asked(True)
     work_off(viewer)
@@ -202,7 +202,7 @@ def test_a_light_that_cannot_be_is_a_message_and_nothing_else(
     viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr(viewer, "complain", said.append)
+    monkeypatch.setattr(viewer, "show_error", said.append)
     before, desk = colors(viewer), viewer.lighting.desk
     viewer.lighting.choose(Light("gone.jpg", "gone.jpg"))
     work_off(viewer)
@@ -304,7 +304,7 @@ def test_a_name_that_is_not_utf8_breaks_nothing(learnt: Trainer, wall: Scene) ->
     viewer = open_on(Subject(learnt.method, replace(wall, views=views)))
     work_off(viewer)
     viewer.photos.visit(None, views[0])
-    viewer.complain(f"{names[0]}: no")
+    viewer.show_error(f"{names[0]}: no")
     work_off(viewer)
     assert viewer.photos._choice.value == "caf\\xe9.jpg"
     buffer = viewer.server._websock_server.get_message_buffer()
