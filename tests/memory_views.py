@@ -74,4 +74,4 @@ class GonePhotos(PhotoStore):
     """A store whose photos cannot be read any more."""
 
     def get(self, name: str) -> Photo:
-        raise UserError(f"images/{name}: no such file; put the photo back, or replace it")
+        raise UserError(f"images/{name}: no such file; restore or replace the photo")

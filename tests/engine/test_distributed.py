@@ -91,7 +91,7 @@ def test_one_ranks_mistake_ends_all_and_is_told_once(ranks: Path) -> None:
 def test_ranks_whose_models_differ_in_size_stop(ranks: Path) -> None:
     first, second = left(ranks, "heard")
     assert first["unlike_sizes"][0] == "DivergedRanksError"
-    assert "3 and 4 numbers" in first["unlike_sizes"][1]
+    assert "3 and 4 elements" in first["unlike_sizes"][1]
     assert second["unlike_sizes"][0] == "ReportedError"
 
 
@@ -156,7 +156,7 @@ def test_fewer_photos_than_processes_is_a_users_mistake(wall_scene, tiny_model) 
         size = 8
 
     method = create_method("3dgs", None, wall_scene)
-    with pytest.raises(UserError, match="7 photos to train on are too few for 8 processes"):
+    with pytest.raises(UserError, match="7 training photos are too few for 8 processes"):
         Trainer(method, wall_scene, TrainConfig(), Crowd())
 
 

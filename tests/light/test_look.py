@@ -59,7 +59,11 @@ def test_rounded_weights_are_no_mistake(looks) -> None:
 
 @pytest.mark.parametrize(
     ("weights", "words"),
-    [([0.5], "2 appearances need 2 weights"), ([0.5, 0.6], "add up to 1.1"), ([float("nan"), 1], "add up")],
+    [
+        ([0.5], "2 appearances need 2 weights"),
+        ([0.5, 0.6], "add up to 1, not to 1.1"),
+        ([float("nan"), 1], "add up"),
+    ],
 )
 def test_bad_weights_are_said(looks, weights, words) -> None:
     with pytest.raises(UserError, match=words):

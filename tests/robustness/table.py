@@ -51,9 +51,9 @@ _DAMAGED = ("left out", r"step_00000002\.safetensors is damaged", "the one befor
 TABLE: dict[str, dict[str, Cell]] = {
     "photo": {
         "missing": ("left out", r"p02\.png \(no such file\)", "left out"),
-        "empty": ("left out", r"p02\.png \(not a readable picture\)", "left out"),
+        "empty": ("left out", r"p02\.png \(not a readable image\)", "left out"),
         "truncated": ("left out", r"p02\.png \(", "left out"),
-        "wrong type": ("left out", r"p02\.png \(not a readable picture\)", "left out"),
+        "wrong type": ("left out", r"p02\.png \(not a readable image\)", "left out"),
         "wrong size": ("error", "its camera is 24x16", "error: not the model's photos"),
         "NaN": ("used", "", "used: NaN is black"),
         "huge": ("left out", r"exceed the limit", "left out unread; `--max-image-pixels` raises the limit"),

@@ -259,7 +259,7 @@ def test_a_text_cut_between_two_lines_is_noticed_by_its_comment(scene: Path, mak
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:9]))
     kind, said = observe(lambda: load_scene(scene, DataConfig(holdout=0)))
     assert kind == "left out"
-    assert "declares 6 entries, and 4 are there" in said
+    assert "its comment declares 6 entries, but it has 4" in said
 
 
 @pytest.fixture

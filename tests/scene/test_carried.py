@@ -215,9 +215,9 @@ def test_whatever_changed_the_runs_own_cameras_and_split_stay(scene: Scene) -> N
         replace(fewer, views=tuple(views), points=fewer.points[:30], point_colors=fewer.point_colors[:30])
     )
     text = "; ".join(differences)
-    assert "2 photos gone: p01.png, p02.png" in text
+    assert "2 photos missing: p01.png, p02.png" in text
     assert "1 photo new (not used): new.png" in text
-    assert "1 photo in another place (the run's own is used): p05.png" in text
+    assert "1 photo with another pose (the run's is used): p05.png" in text
     assert "2 photos in another split" in text
     assert "other sparse points" in text
     assert [view.name for view in adopted.views] == [f"p{i:02d}.png" for i in (0, 3, 4, 5, 6, 7, 8)]

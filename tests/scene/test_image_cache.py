@@ -104,7 +104,7 @@ def test_a_photo_that_vanished_is_named(make_scene: Callable[..., Path]) -> None
     (root / "images" / name).unlink()
     scene.views[1].prefetch()
     for _ in range(2):
-        with pytest.raises(UserError, match=rf"{name}: no such file; put the photo back"):
+        with pytest.raises(UserError, match=rf"{name}: no such file; restore or replace the photo"):
             scene.views[1].read_photo()
 
 
