@@ -40,11 +40,11 @@ def test_mask_weight_falls_linearly_and_stays_in_its_range():
 
 
 def test_few_photos_begin_with_a_lower_mask_weight():
-    config = ObjectiveConfig(mask_weight_photos=80)
-    starts = [config.mask_weight(0.0, photos) for photos in (200, 80, 60, 40, 1)]
+    config = ObjectiveConfig(mask_weight_photos=60)
+    starts = [config.mask_weight(0.0, photos) for photos in (200, 60, 50, 40, 1)]
     assert starts == pytest.approx([0.4, 0.4, 0.25, 0.1, 0.1])
-    assert config.mask_weight(0.5, 60) == pytest.approx(0.175)
-    assert config.mask_weight(1.0, 60) == pytest.approx(config.mask_weight_end)
+    assert config.mask_weight(0.5, 50) == pytest.approx(0.175)
+    assert config.mask_weight(1.0, 50) == pytest.approx(config.mask_weight_end)
     assert ObjectiveConfig(mask_weight_photos=0).mask_weight(0.0, 1) == pytest.approx(0.4)
 
 

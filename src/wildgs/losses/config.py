@@ -15,7 +15,7 @@ class ObjectiveConfig:
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
         mask_weight_photos: Number of training photos from which on λ^M starts at `mask_weight_start`. With fewer
-            photos it starts lower, at `mask_weight_end` with half as many: a few photos are memorised, and
+            photos it starts lower, at `mask_weight_end` with two thirds as many: a few photos are memorised, and
             passers-by with them, unless masks are quick. 0 disables this. Not in the paper.
         mask_power: Exponent of M in the image loss (paper: 1). Above 1, pixels that may be transient count little
             before the mask is sure of it.
@@ -31,7 +31,7 @@ class ObjectiveConfig:
     weight_l1: float = 0.8
     mask_weight_start: float = 0.4
     mask_weight_end: float = 0.1
-    mask_weight_photos: int = 70
+    mask_weight_photos: int = 50
     mask_power: float = 3.0
     depth_weight: float = 0.01
     metric_weight: float = 0.1
@@ -47,7 +47,7 @@ class ObjectiveConfig:
         """
         start = self.mask_weight_start
         if num_photos is not None and num_photos < self.mask_weight_photos:
-            beyond_half = max(2 * num_photos / self.mask_weight_photos - 1, 0.0)
-            start = self.mask_weight_end + (start - self.mask_weight_end) * beyond_half
+            beyond_few = max(3 * num_photos / self.mask_weight_photos - 2, 0.0)
+            start = self.mask_weight_end + (start - self.mask_weight_end) * beyond_few
         share = min(max(progress, 0.0), 1.0)
         return start + (self.mask_weight_end - start) * share
