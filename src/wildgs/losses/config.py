@@ -15,10 +15,11 @@ class ObjectiveConfig:
         mask_weight_start: λ^M at the first step.
         mask_weight_end: λ^M at the last step; linear in between.
         mask_weight_photos: Number of training photos from which on λ^M starts at `mask_weight_start`. With fewer
-            photos it starts lower, at `mask_weight_end` with two thirds as many: a few photos are memorised, and
-            passers-by with them, unless masks are quick. 0 disables this. Not in the paper.
-        mask_power: Exponent of M in the image loss (paper: 1). Above 1, pixels that may be transient count little
-            before the mask is sure of it.
+            photos it starts lower (at `mask_weight_end` with two thirds as many), because a few photos are
+            memorised, including passers-by, before a reluctant mask has found them. 0 disables this. Not in the
+            paper.
+        mask_power: Exponent of M in the image loss (paper: 1). Above 1, pixels that the mask is unsure of have
+            little weight.
         depth_weight: λ^D (paper: 0.05).
         metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
         mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
