@@ -86,12 +86,17 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert model.pop("local_embeddings") is False
     assert model["sky"].pop("densify") is False
     assert train["optimizer"].pop("short_runs") > 0
+    assert train["objective"].pop("mask_weight_photos") > 0
+    assert train["objective"].pop("mask_power") > 1
+    assert train["density"].pop("min_visibility") > 0.5
     config = from_plain(RunConfig, plain)
     assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
     assert config.model.eps2d == 0.3  # with which its Gaussians were trained
     assert config.model.local_embeddings
     assert config.model.sky.densify
     assert config.train.optimizer.short_runs == 0
+    assert (config.train.objective.mask_weight_photos, config.train.objective.mask_power) == (0, 1)
+    assert config.train.density.min_visibility == 0.5
     assert from_plain(RunConfig, to_plain(BASE)) == BASE
 
 

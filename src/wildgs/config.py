@@ -291,9 +291,7 @@ def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
             return from_plain(kind, value, where)
         except UserError:
             continue
-    names = " or ".join(
-        "None" if kind is type(None) else getattr(kind, "__name__", str(kind)) for kind in kinds
-    )
+    names = " or ".join("None" if k is type(None) else getattr(k, "__name__", str(k)) for k in kinds)
     raise UserError(f"{where}: {reprlib.repr(value)} is not of type {names}")
 
 

@@ -208,7 +208,7 @@ def _list_tiles(
     n = tile_counts.size
     seen = int(np.count_nonzero(tile_counts))
     ranks, homes = np.empty(n, np.int32), np.empty(seen, np.int32)
-    ranked_records, starts = _aligned(seen * RECORD, np.float32), np.empty(seen + 1, np.int64)
+    ranked_records, starts = np.empty(seen * RECORD, np.float32), np.empty(seen + 1, np.int64)
     offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
     chunks = max(1, min(2 * thread_count(), n // 1024))
     with (
