@@ -3,9 +3,9 @@
 A tile of 16 x 16 pixels is sixteen blocks of 4 x 4; a block is one vector. For each Gaussian of the tile's list
 only the blocks that it reaches and that still let light through are visited.
 
-A block's numbers lie together in memory: transmittance, alpha and depth sums, then the channels' sums.
-Transmittance doubles as the pixels' state: negative where the pixel is saturated (its value is the
-magnitude) or outside the picture.
+A block's numbers lie together in memory: transmittance, columns, alpha and depth sums, then the channels'. Pixels that
+are saturated or outside the picture have the column `CLOSED`, so far away that no Gaussian reaches it: the loop
+needs no further test for them.
 """
 
 from __future__ import annotations
@@ -13,20 +13,17 @@ from __future__ import annotations
 import numpy as np
 
 from wildgs.kernel_cache import njit
-from wildgs.rasterize.cpu.picture_kernels import PATCH, aligned, ask_for_tile, close_tile, open_tile
+from wildgs.rasterize.cpu.picture_kernels import CLOSED, PATCH, aligned, ask_for_tile, close_tile, open_tile
 from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, RECORD, TILE, reach
 from wildgs.rasterize.cpu.simd import (
     LANES,
     fma,
-    lane_x,
     lane_y,
     lowest_bit,
     mask_bits,
-    minus_magnitude,
     select,
     splat,
     vexp2,
-    vmax,
     vmin,
 )
 from wildgs.rasterize.cpu.simd_memory import copy4, copy8, prefetch, vbits, vload, vspread, vstore
@@ -94,7 +91,7 @@ def blend_forward(
     and block for the backward pass; they are None where there will be none.
     """
     tiles_x = (width + TILE - 1) // TILE
-    stride = (channels + 3) * LANES
+    stride = (channels + 4) * LANES
     sums = aligned(16 * stride)
     reached = aligned(PIXELS)
     patch = aligned(PATCH)
@@ -127,14 +124,14 @@ def blend_forward(
                 if (alive >> block) & 1 == 0 or word == 0:
                     continue
                 at = block * stride
-                px = lane_x() + np.float32((block & 3) * 4)
                 py = lane_y() + np.float32((block >> 2) * 4)
-                before, total, depth = vload(sums, at), vload(sums, at + LANES), vload(sums, at + 2 * LANES)
+                before, px = vload(sums, at), vload(sums, at + LANES)
+                total, depth = vload(sums, at + 2 * LANES), vload(sums, at + 3 * LANES)
                 hits = splat(0.0)
                 red, green, blue = splat(0.0), splat(0.0), splat(0.0)
                 if channels == 3:
-                    red, green = vload(sums, at + 3 * LANES), vload(sums, at + 4 * LANES)
-                    blue = vload(sums, at + 5 * LANES)
+                    red, green = vload(sums, at + 4 * LANES), vload(sums, at + 5 * LANES)
+                    blue = vload(sums, at + 6 * LANES)
                 while word != 0:
                     i = lowest_bit(word)
                     word &= word - 1
@@ -143,15 +140,15 @@ def blend_forward(
                     v = fma(py, vspread(batch, g + D), vspread(batch, g + V))
                     exponent = fma(-u, u, fma(-v, v, vspread(batch, g + LEVEL)))
                     alpha = vmin(vexp2(exponent), MAX_ALPHA)
-                    after = fma(-before, alpha, before)
                     hit = exponent >= MIN_LEVEL
-                    kept = hit & (after > MIN_TRANSMITTANCE)
-                    weight = select(kept, before * alpha, 0.0)
-                    total = total + weight
-                    # Below 0 where saturated: `after` is then below 0, too, and nothing is kept.
-                    before = select(kept, after, select(hit, minus_magnitude(before), before))
+                    after = select(hit, fma(-before, alpha, before), before)
+                    full = after <= MIN_TRANSMITTANCE
+                    if mask_bits(full) != 0:
+                        px, after, hit = select(full, CLOSED, px), select(full, before, after), hit & ~full
+                    weight = select(hit, before * alpha, 0.0)
+                    before, total = after, total + weight
                     if last is not None:
-                        hits = select(kept, vspread(positions, i), hits)
+                        hits = select(hit, vspread(positions, i), hits)
                     if with_depth:
                         depth = fma(weight, vspread(batch, g + DEPTH), depth)
                     if channels == 3:
@@ -161,19 +158,20 @@ def blend_forward(
                     else:
                         first = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
-                            to = at + (k + 3) * LANES
+                            to = at + (k + 4) * LANES
                             vstore(sums, to, fma(weight, values[first + k], vload(sums, to)))
                 vstore(sums, at, before)
-                vstore(sums, at + LANES, total)
-                vstore(sums, at + 2 * LANES, depth)
+                vstore(sums, at + LANES, px)
+                vstore(sums, at + 2 * LANES, total)
+                vstore(sums, at + 3 * LANES, depth)
                 if last is not None:
                     hits = select(hits > 0.0, hits + np.float32(start - begin), vload(reached, block * LANES))
                     vstore(reached, block * LANES, hits)
                 if channels == 3:
-                    vstore(sums, at + 3 * LANES, red)
-                    vstore(sums, at + 4 * LANES, green)
-                    vstore(sums, at + 5 * LANES, blue)
-                if mask_bits(before > 0.0) == 0:
+                    vstore(sums, at + 4 * LANES, red)
+                    vstore(sums, at + 5 * LANES, green)
+                    vstore(sums, at + 6 * LANES, blue)
+                if mask_bits(px < CLOSED) == 0:
                     alive &= ~(1 << block)
         close_tile(
             tx, ty, width, height, channels, with_depth, background, stride, sums, patch,
@@ -181,7 +179,6 @@ def blend_forward(
         )  # fmt: skip
         if last is not None:
             for block in range(16):
-                transmittance = vload(sums, block * stride)
                 to = tile * PIXELS + block * LANES
-                vstore(final_transmittance, to, vmax(transmittance, -transmittance))
+                vstore(final_transmittance, to, vload(sums, block * stride))
                 vstore(last, to, vload(reached, block * LANES))

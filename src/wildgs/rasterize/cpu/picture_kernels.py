@@ -6,11 +6,12 @@ import numpy as np
 
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.reach_kernels import TILE
-from wildgs.rasterize.cpu.simd import select, splat, vmax, vmin
+from wildgs.rasterize.cpu.simd import lane_x, select, splat, vmin
 from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vload3, vstore, vstore3
 
 LANES = 16
 PATCH = 48  # floats that a block of three channels has
+CLOSED = np.float32(1e15)  # column of a pixel that takes nothing more; its square is finite
 
 
 @njit(nogil=True)
@@ -65,18 +66,19 @@ def ask_for_tile(tx, ty, width, height, per_pixel, picture, to_write):
 
 @njit(nogil=True)
 def open_tile(tx, ty, width, height, stride, sums):
-    """Sums 0 and transmittance 1 inside the picture, -1 outside; returns the bits of blocks with pixels inside."""
+    """Sums 0, transmittance 1, and columns (`CLOSED` outside the picture); returns the bits of blocks inside."""
     alive = 0
     sums[:] = 0.0
     for block in range(16):
         x, y = tx * TILE + (block & 3) * 4, ty * TILE + (block >> 2) * 4
-        vstore(sums, block * stride, splat(1.0 if x < width and y < height else -1.0))
+        vstore(sums, block * stride, splat(1.0))
+        vstore(sums, block * stride + LANES, lane_x() + np.float32((block & 3) * 4))
         if x < width and y < height:
             alive |= 1 << block
             if x + 4 > width or y + 4 > height:
                 for lane in range(LANES):
                     if x + (lane & 3) >= width or y + (lane >> 2) >= height:
-                        sums[block * stride + lane] = -1.0
+                        sums[block * stride + LANES + lane] = CLOSED
     return alive
 
 
@@ -90,28 +92,27 @@ def close_tile(
         if x >= width or y >= height:
             continue
         transmittance = vload(sums, at)
-        transmittance = vmax(transmittance, -transmittance)
         # Summed, not 1 - transmittance: what is faint would have few digits left.
-        alpha = vmin(vload(sums, at + LANES), 1.0)
+        alpha = vmin(vload(sums, at + 2 * LANES), 1.0)
         vstore(patch, 0, alpha)
         put_rows(patch, 1, out_alpha, x, y, width, height)
         if with_depth:
             seen = alpha > 0.0
-            vstore(patch, 0, select(seen, vload(sums, at + 2 * LANES) / select(seen, alpha, 1.0), 0.0))
+            vstore(patch, 0, select(seen, vload(sums, at + 3 * LANES) / select(seen, alpha, 1.0), 0.0))
             put_rows(patch, 1, out_depth, x, y, width, height)
         if channels == 3:
-            red = vload(sums, at + 3 * LANES) + transmittance * background[0]
-            green = vload(sums, at + 4 * LANES) + transmittance * background[1]
-            blue = vload(sums, at + 5 * LANES) + transmittance * background[2]
+            red = vload(sums, at + 4 * LANES) + transmittance * background[0]
+            green = vload(sums, at + 5 * LANES) + transmittance * background[1]
+            blue = vload(sums, at + 6 * LANES) + transmittance * background[2]
             vstore3(patch, 0, (red, green, blue))
             put_rows(patch, 3, out_colors, x, y, width, height)
         else:
             for lane in range(LANES):
                 if x + (lane & 3) < width and y + (lane >> 2) < height:
                     pixel = (y + (lane >> 2)) * width + x + (lane & 3)
-                    through = abs(sums[at + lane])
+                    through = sums[at + lane]
                     for k in range(channels):
-                        value = sums[at + (k + 3) * LANES + lane] + through * background[k]
+                        value = sums[at + (k + 4) * LANES + lane] + through * background[k]
                         out_colors[pixel * channels + k] = value
 
 

@@ -263,17 +263,6 @@ def vratio(typingctx, a, b):
     return (VECTOR(a, b), codegen) if a is VECTOR and b is VECTOR else None
 
 
-@intrinsic
-def minus_magnitude(typingctx, value):
-    """-|x| per lane: sets the sign bit."""
-
-    def codegen(context, builder, sig, args):
-        sign = ir.Constant(INT_VECTOR, [-(2**31)] * LANES)
-        return builder.bitcast(builder.or_(builder.bitcast(args[0], INT_VECTOR), sign), VECTOR_IR)
-
-    return (VECTOR(value), codegen) if value is VECTOR else None
-
-
 # exp2 on [-0.5, 0.5], minimax of degree 5, relative error 7.5e-8.
 _EXP2 = (1.32765e-3, 9.67554e-3, 5.550713e-2, 2.402212e-1, 6.9314697e-1, 1.00000007)
 
