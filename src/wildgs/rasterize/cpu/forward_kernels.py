@@ -3,9 +3,9 @@
 A tile of 16 x 16 pixels is sixteen blocks of 4 x 4; a block is one vector. For each Gaussian of the tile's list
 only the blocks that it reaches and that still let light through are visited.
 
-A block's numbers lie together in memory: transmittance, columns, alpha and depth sums, then the channels'. Pixels that
-are saturated or outside the picture have the column `CLOSED`, so far away that no Gaussian reaches it: the loop
-needs no further test for them.
+A block's numbers lie together in memory: transmittance, columns, alpha and depth sums, then the channels' sums.
+Pixels that are saturated or outside the picture have the column `CLOSED`, so far away that no Gaussian reaches it:
+the loop needs no further test for them.
 """
 
 from __future__ import annotations
