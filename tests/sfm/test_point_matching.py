@@ -65,6 +65,14 @@ def test_photos_left_out_are_drawn_beside_their_partner(matched: tuple[Workplace
         assert picture.width == 2 * SIDE
 
 
+def test_photos_that_only_match_each_other_are_named_as_a_group(
+    matched: tuple[Workplace, list[WorkingCopy]],
+) -> None:
+    work, copies = matched
+    reasons = failures(work, copies, [pycolmap.Reconstruction()], Findings())
+    assert "separate group of 6 photos (with 1.jpg, 2.jpg, 3.jpg)" in reasons["0.jpg"].reason
+
+
 def test_lines_end_where_the_matches_are() -> None:
     photos = [Image.new("RGB", (640, 320)), Image.new("RGB", (160, 320))]
     picture = np.asarray(draw_matches(photos, [np.array([[100.0, 200.0]]), np.array([[80.0, 40.0]])]))

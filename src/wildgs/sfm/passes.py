@@ -31,8 +31,8 @@ from wildgs.sfm.workplace import Workplace
 ENOUGH_MATCHES = 60
 """Number of matches from which a pair is not matched again."""
 
-POINT_ROUNDS = 3
-"""Rounds of matching to points, since newly registered photos add points for others."""
+POINT_ROUNDS = 5
+"""Upper bound on rounds of matching to points; newly registered photos add points for others."""
 
 LEAST_POINTS = 10
 """Smallest number of sparse points of a photo registered by a later pass."""
