@@ -23,6 +23,9 @@ LEAST_GROUP = 3
 LATE_INLIERS = 15
 """Smallest number of inliers for registering a photo in later passes; 30 in the first."""
 LATE_INLIER_RATIO = 0.1
+LATE_REFINEMENTS = 2
+"""Upper bound on repetitions of a global bundle adjustment, which takes most of the time of later passes; 5 in the
+first."""
 
 
 @contextmanager
@@ -60,6 +63,7 @@ def continue_mapping(work: Workplace, model: Any, count: int, config: SfmConfig,
     options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
     options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
     options.multiple_models = False
+    options.ba_global_max_refinements = LATE_REFINEMENTS
     models = pycolmap.incremental_mapping(
         work.database,
         work.images,
