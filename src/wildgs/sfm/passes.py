@@ -19,6 +19,7 @@ from wildgs.sfm.mapping import (
     LEAST_GROUP,
     continue_mapping,
     map_photos,
+    map_repeatedly,
     missing_from,
 )
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
@@ -68,7 +69,7 @@ def find_poses(
     pairing, crops = match(work, copies, vlads, config, progress)
     models = work.load_models("first")
     if models is None:
-        models = map_photos(work, len(copies), config, progress)
+        models = map_repeatedly(work, copies, config, progress)
         work.save_models("first", models)
     passes: dict[str, PassName] = {}
     if config.second_chance:

@@ -148,7 +148,7 @@ def _reason(
         return f"a copy or crop of {copies[findings.crops[row]].name}, which has no pose"
     other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
     members = [r for r in groups[row] if r != row]
-    if other is not None:
+    if other is not None and other.num_reg_images() > len(members):
         members = [r for r, c in enumerate(copies) if r != row and find_registered(other, c) is not None]
     if len(members) + 1 >= LEAST_GROUP:
         names = ", ".join(copies[r].name for r in sorted(members)[:3])
