@@ -25,6 +25,9 @@ FIRST_ATTEMPTS, ATTEMPTS_LIMIT = 3, 200
 """Upper bound on runs of the first pass, and number of photos up to which it is repeated. A poor initial pair,
 which depends on the seed, cost up to nine tenths of the photos, and a run is short compared with matching."""
 
+REFINEMENTS = 2
+"""Upper bound on repetitions of a global bundle adjustment, which takes most of the time; COLMAP's default is 5."""
+
 MAX_EXTRA_PARAM = 10.0
 """Largest distortion coefficient during mapping. It refers to the squared tangent of the angle from the axis: -1.9
 moves the corners of a telephoto lens by only 4%. `wildgs.sfm.lenses` then decides by the corners."""
@@ -32,9 +35,6 @@ moves the corners of a telephoto lens by only 4%. `wildgs.sfm.lenses` then decid
 LATE_INLIERS = 15
 """Smallest number of inliers for registering a photo in later passes; 30 in the first."""
 LATE_INLIER_RATIO = 0.1
-LATE_REFINEMENTS = 2
-"""Upper bound on repetitions of a global bundle adjustment, which takes most of the time of later passes; 5 in the
-first."""
 
 
 @contextmanager
@@ -89,7 +89,6 @@ def continue_mapping(work: Workplace, model: Any, count: int, config: SfmConfig,
     options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
     options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
     options.multiple_models = False
-    options.ba_global_max_refinements = LATE_REFINEMENTS
     models = pycolmap.incremental_mapping(
         work.database,
         work.images,
@@ -110,6 +109,7 @@ def _options(config: SfmConfig) -> Any:
     # RANSAC over matches between photos alone took from half a minute to more than eleven for one photo with few
     # correct ones. The second pass, which matches photos to points, places such photos in about a second.
     options.structure_less_registration_fallback = False
+    options.ba_global_max_refinements = REFINEMENTS
     options.max_extra_param = MAX_EXTRA_PARAM
     options.min_focal_length_ratio, options.max_focal_length_ratio = FOCAL_RANGE
     return options
