@@ -9,7 +9,7 @@ from wildgs.progress import silent
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import continue_mapping, map_photos, missing_from
 from wildgs.sfm.match_pictures import SIDE, draw_matches, write_match_pictures
-from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, verified_pairs
+from wildgs.sfm.matching import describe_photos, extract, forget_pairs, image_ids, match, verified_pairs
 from wildgs.sfm.placement import Findings, failures
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
@@ -30,6 +30,14 @@ def matched(corner, tmp_path_factory: pytest.TempPathFactory) -> tuple[Workplace
     match(work, copies, describe_photos(work, copies, 0), SfmConfig(), silent)
     forget_pairs(work, copies, [(other, LOST) for other in range(LOST) if other != 2])
     return work, copies
+
+
+def test_photos_are_numbered_in_order_by_any_number_of_threads(
+    matched: tuple[Workplace, list[WorkingCopy]],
+) -> None:
+    work, copies = matched
+    with pycolmap.Database.open(work.database) as database:
+        assert image_ids(database, copies) == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_photo_finds_its_pose_by_points(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
@@ -63,6 +71,14 @@ def test_photos_left_out_are_drawn_beside_their_partner(matched: tuple[Workplace
     pictures = write_match_pictures(work, copies, without)
     with Image.open(work.scene / pictures[f"{LOST}.jpg"]) as picture:
         assert picture.width == 2 * SIDE
+
+
+def test_photos_that_only_match_each_other_are_named_as_a_group(
+    matched: tuple[Workplace, list[WorkingCopy]],
+) -> None:
+    work, copies = matched
+    reasons = failures(work, copies, [pycolmap.Reconstruction()], Findings())
+    assert "separate group of 6 photos (with 1.jpg, 2.jpg, 3.jpg)" in reasons["0.jpg"].reason
 
 
 def test_lines_end_where_the_matches_are() -> None:

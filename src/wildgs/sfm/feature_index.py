@@ -172,7 +172,13 @@ def match_features(
     Returns:
         Indices of features and of points; every point occurs once, with its most similar feature.
     """
-    likeness, owners = _nearest(features, index)
+    return select_matches(*nearest_points(features, index), ratio)
+
+
+def select_matches(
+    likeness: Shaped[np.ndarray, "F k"], owners: Int64[np.ndarray, "F k"], ratio: float
+) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
+    """The ratio test of `match_features` on the result of `nearest_points`."""
     distance = np.arccos(np.clip(likeness, -1, 1))
     rivals = np.where(owners == owners[:, :1], np.inf, distance).min(axis=1)
     good = np.flatnonzero(distance[:, 0] < ratio * np.minimum(rivals, np.pi / 2))
@@ -182,7 +188,7 @@ def match_features(
     return np.array(list(best.values()), np.int64), np.array(list(best.keys()), np.int64)
 
 
-def _nearest(
+def nearest_points(
     features: UInt8[np.ndarray, "F 128"], index: FeatureIndex, count: int = 8, block: int = 65_536
 ) -> tuple[Shaped[np.ndarray, "F k"], Int64[np.ndarray, "F k"]]:
     """Cosine similarity and owner of the most similar descriptors, best first, computed in blocks."""

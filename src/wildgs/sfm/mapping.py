@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import pycolmap
@@ -19,6 +20,17 @@ from wildgs.sfm.workplace import Workplace
 
 LEAST_GROUP = 3
 """Smallest number of photos of a model."""
+
+FIRST_ATTEMPTS, ATTEMPTS_LIMIT = 3, 200
+"""Upper bound on runs of the first pass, and number of photos up to which it is repeated. A poor initial pair,
+which depends on the seed, cost up to nine tenths of the photos, and a run is short compared with matching."""
+
+REFINEMENTS = 2
+"""Upper bound on repetitions of a global bundle adjustment, which takes most of the time; COLMAP's default is 5."""
+
+MAX_EXTRA_PARAM = 10.0
+"""Largest distortion coefficient during mapping. It refers to the squared tangent of the angle from the axis: -1.9
+moves the corners of a telephoto lens by only 4%. `wildgs.sfm.lenses` then decides by the corners."""
 
 LATE_INLIERS = 15
 """Smallest number of inliers for registering a photo in later passes; 30 in the first."""
@@ -34,6 +46,23 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = previous
+
+
+def map_repeatedly(
+    work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress
+) -> list[Any]:
+    """Repeats incremental mapping with other seeds while photos are missing; returns the models of the best run.
+
+    The best run is the one whose largest model has the most observations.
+    """
+    best: list[Any] = []
+    for attempt in range(FIRST_ATTEMPTS if len(copies) <= ATTEMPTS_LIMIT else 1):
+        models = map_photos(work, len(copies), replace(config, seed=config.seed + attempt), progress)
+        if models and (not best or models[0].compute_num_observations() > best[0].compute_num_observations()):
+            best = models
+        if best and not missing_from(best[0], copies):
+            break
+    return best
 
 
 def map_photos(
@@ -77,6 +106,11 @@ def _options(config: SfmConfig) -> Any:
     options.num_threads = config.threads
     options.random_seed = config.seed
     options.min_model_size = LEAST_GROUP
+    # RANSAC over matches between photos alone took from half a minute to more than eleven for one photo with few
+    # correct ones. The second pass, which matches photos to points, places such photos in about a second.
+    options.structure_less_registration_fallback = False
+    options.ba_global_max_refinements = REFINEMENTS
+    options.max_extra_param = MAX_EXTRA_PARAM
     options.min_focal_length_ratio, options.max_focal_length_ratio = FOCAL_RANGE
     return options
 

@@ -37,6 +37,10 @@ def extract(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, p
     options.num_threads = config.threads
     options.sift.max_num_features = config.max_features
     options.sift.estimate_affine_shape = config.affine_features
+    # Extraction numbers photos in the order in which threads finish, on which matching and mapping depend.
+    names = [copy.work_name for copy in copies]
+    pycolmap.Database.open(work.database).close()  # creates it
+    pycolmap.import_images(work.database, work.images, pycolmap.CameraMode.PER_IMAGE, names)
     done = 0
     # Separate calls, because COLMAP skips photos without a mask if a folder of masks is given.
     for masked in (False, True):

@@ -19,6 +19,7 @@ from wildgs.sfm.mapping import (
     LEAST_GROUP,
     continue_mapping,
     map_photos,
+    map_repeatedly,
     missing_from,
 )
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
@@ -31,8 +32,8 @@ from wildgs.sfm.workplace import Workplace
 ENOUGH_MATCHES = 60
 """Number of matches from which a pair is not matched again."""
 
-POINT_ROUNDS = 3
-"""Rounds of matching to points, since newly registered photos add points for others."""
+POINT_ROUNDS = 5
+"""Upper bound on rounds of matching to points; newly registered photos add points for others."""
 
 LEAST_POINTS = 10
 """Smallest number of sparse points of a photo registered by a later pass."""
@@ -68,7 +69,7 @@ def find_poses(
     pairing, crops = match(work, copies, vlads, config, progress)
     models = work.load_models("first")
     if models is None:
-        models = map_photos(work, len(copies), config, progress)
+        models = map_repeatedly(work, copies, config, progress)
         work.save_models("first", models)
     passes: dict[str, PassName] = {}
     if config.second_chance:

@@ -11,8 +11,9 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 
-from wildgs.sfm.mapping import find_registered
+from wildgs.sfm.mapping import LEAST_GROUP, find_registered, missing_from
 from wildgs.sfm.matching import image_ids, verified_pairs
+from wildgs.sfm.pairs import Pair
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -20,6 +21,9 @@ PassName = Literal["first", "second", "third"]
 
 NEIGHBOUR_POINTS = 15
 """Smallest number of points shared with a neighbour."""
+
+GROUP_MATCHES = 30
+"""Smallest number of matches between photos without a pose that show the same thing."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +109,24 @@ def failures(
     for (a, b), inliers in found.items():
         best[a] = max(best.get(a, (0, 0)), (inliers, b))
         best[b] = max(best.get(b, (0, 0)), (inliers, a))
+    missing = missing_from(models[0], copies)
+    groups = _groups(missing, found)
     result = {}
-    for row, copy in enumerate(copies):
-        if find_registered(models[0], copy) is not None:
-            continue
+    for row in missing:
         inliers, partner = best.get(row, (0, row))
-        reason = _reason(row, copies, models, findings, blank, inliers, partner)
-        result[copy.name] = Failure(reason, copies[partner].name if inliers else None)
+        reason = _reason(row, copies, models, findings, blank, groups, inliers, partner)
+        result[copies[row].name] = Failure(reason, copies[partner].name if inliers else None)
     return result
+
+
+def _groups(missing: Sequence[int], found: Mapping[Pair, int]) -> dict[int, list[int]]:
+    """The photos without a pose that each of them is linked to by matches with each other, itself included."""
+    group = {row: [row] for row in missing}
+    for (a, b), inliers in found.items():
+        if inliers >= GROUP_MATCHES and a in group and b in group and group[a] is not group[b]:
+            group[a] += group[b]
+            group |= dict.fromkeys(group[b], group[a])
+    return group
 
 
 def _reason(
@@ -121,6 +135,7 @@ def _reason(
     models: Sequence[Any],
     findings: Findings,
     blank: set[int],
+    groups: Mapping[int, Sequence[int]],
     inliers: int,
     partner: int,
 ) -> str:
@@ -129,15 +144,18 @@ def _reason(
         return "no features found (blank, blurred or very small)"
     if copy.work_name in findings.lenses:
         return findings.lenses[copy.work_name]
-    other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
-    if other is not None:
-        members = [c.name for c in copies if c is not copy and find_registered(other, c) is not None]
-        return (
-            f"belongs to a separate group of {other.num_reg_images()} photos (with {', '.join(members[:3])}) with"
-            " too few matches to the others; photos taken in between would connect them"
-        )
     if row in findings.crops:
         return f"a copy or crop of {copies[findings.crops[row]].name}, which has no pose"
+    other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
+    members = [r for r in groups[row] if r != row]
+    if other is not None and other.num_reg_images() > len(members):
+        members = [r for r, c in enumerate(copies) if r != row and find_registered(other, c) is not None]
+    if len(members) + 1 >= LEAST_GROUP:
+        names = ", ".join(copies[r].name for r in sorted(members)[:3])
+        return (
+            f"belongs to a separate group of {len(members) + 1} photos (with {names}) with too few matches to the"
+            " scene, because they show another side or another place; photos taken in between would connect them"
+        )
     if inliers == 0:
         return "matches no other photo"
     if find_registered(models[0], copies[partner]) is None:

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
 from wildgs.progress import Counter
-from wildgs.sfm.feature_index import FeatureIndex, match_features
+from wildgs.sfm.feature_index import FeatureIndex, nearest_points, select_matches
 from wildgs.sfm.localization import MIN_INLIERS, solve_pose
 from wildgs.sfm.mapping import find_registered, missing_from
 from wildgs.sfm.matching import image_ids
@@ -104,8 +104,9 @@ def _solve_photo(
     descriptors = np.array(database.read_descriptors(image_id).data)
     keypoints = database.read_keypoints(image_id)[:, :2].astype(np.float64)
     stored = database.read_camera(database.read_image(image_id).camera_id)
+    nearest = nearest_points(descriptors, index)
     for ratio in RATIOS:
-        features, points = match_features(descriptors, index, ratio)
+        features, points = select_matches(*nearest, ratio)
         camera = pycolmap.Camera(stored.todict())
         answer = solve_pose(
             keypoints[features], index.points[points], camera, stored.has_prior_focal_length, seed

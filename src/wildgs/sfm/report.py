@@ -11,9 +11,15 @@ from typing import Any
 from wildgs.files import printable, read_json
 from wildgs.scene.colmap import describe_names
 from wildgs.sfm.pairs import PairingName
-from wildgs.sfm.placement import Placement
+from wildgs.sfm.placement import PassName, Placement
 
 REPORT_NAME = "sfm_report.json"
+
+PASSES: Mapping[PassName, str] = {
+    "first": "matches between photos",
+    "second": "matches to points of the model",
+    "third": "more pairs, fewer inliers",
+}
 
 
 @dataclass(frozen=True)
@@ -61,9 +67,10 @@ class SfmReport:
             f" {self.reprojection_error:.2f} px mean reprojection error"
             f" ({self.pairs} pairs, {self.pairing}, {self.seconds:.0f} s)"
         ]
-        later = [name for name, how in self.placed.items() if how.placed_by != "first"]
-        if later:
-            text.append(f"{len(later)} of them by the second or third pass: {_some(later)}")
+        for name, how in PASSES.items():
+            placed = [photo for photo, placement in self.placed.items() if placement.placed_by == name]
+            if placed and name != "first":
+                text.append(f"{len(placed)} of them by the {name} pass ({how}): {_some(placed)}")
         if self.copies:
             text.append(
                 f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"

@@ -1,0 +1,17 @@
+from wildgs.sfm.placement import _groups
+
+
+def test_photos_that_match_each_other_alone_form_a_group() -> None:
+    matches = {(0, 1): 500, (1, 2): 90, (2, 3): 40, (4, 5): 29, (3, 6): 12, (5, 7): 35}
+    groups = _groups([1, 2, 3, 4, 5, 6], matches)
+    assert [sorted(groups[photo]) for photo in (1, 2, 3)] == [[1, 2, 3]] * 3  # 0 has a pose
+    assert [groups[photo] for photo in (4, 5, 6)] == [
+        [4],
+        [5],
+        [6],
+    ]  # matches by chance, and with 7, which has one
+
+
+def test_groups_that_a_later_pair_links_become_one() -> None:
+    groups = _groups([0, 1, 2, 3], {(0, 1): 50, (2, 3): 50, (1, 3): 50})
+    assert all(sorted(group) == [0, 1, 2, 3] for group in groups.values())
