@@ -109,6 +109,7 @@ def _options(config: SfmConfig) -> Any:
     # RANSAC over matches between photos alone took from half a minute to more than eleven for one photo with few
     # correct ones. The second pass, which matches photos to points, places such photos in about a second.
     options.structure_less_registration_fallback = False
+    options.ignore_watermarks = True
     options.ba_global_max_refinements = REFINEMENTS
     options.max_extra_param = MAX_EXTRA_PARAM
     options.min_focal_length_ratio, options.max_focal_length_ratio = FOCAL_RANGE

@@ -110,8 +110,17 @@ def match(
     likeness = vlads @ vlads.T
     nearest = alike_pairs(vlads, dict.fromkeys(range(len(copies)), 1))
     twins = {(a, b) for a, b in nearest if likeness[a, b] > CANDIDATE_LIKENESS}
-    match_pairs(work, copies, twins, config, lambda done, total: progress("matching copies", done, total))
+    match_pairs(
+        work,
+        copies,
+        twins,
+        config,
+        lambda done, total: progress("matching copies", done, total),
+        keep_stationary=True,
+    )
     crops = find_crops(work, copies, twins)
+    others = {pair for pair in twins if len({crops.get(photo, photo) for photo in pair}) > 1}
+    forget_pairs(work, copies, others)
     kept = [photo for photo in range(len(copies)) if photo not in crops]
     rows = {photo: row for row, photo in enumerate(kept)}
     positions = {
@@ -122,7 +131,11 @@ def match(
     chosen = choose_pairs(vlads[kept], positions, config.pairing)
     pairs = {(kept[a], kept[b]) for a, b in chosen.pairs}
     match_pairs(
-        work, copies, pairs - twins, config, lambda done, total: progress("matching pairs", done, total)
+        work,
+        copies,
+        (pairs - twins) | others,
+        config,
+        lambda done, total: progress("matching pairs", done, total),
     )
     return Pairing(chosen.name, tuple(sorted(pairs | twins))), crops
 
@@ -135,8 +148,12 @@ def match_pairs(
     progress: Callable[[int, int], None],
     *,
     tolerant: bool = False,
+    keep_stationary: bool = False,
 ) -> None:
     """Matches pairs and verifies the matches, except those already in the database.
+
+    Matches at the same pixel of both photos are left out, because they are watermarks and captions of agencies:
+    photos of different views were registered at one place by them.
 
     Args:
         work: The workplace; its database contains the features, and the matches are written to it.
@@ -145,11 +162,13 @@ def match_pairs(
         config: Threads and seed.
         progress: Called with (pairs matched, total number of pairs).
         tolerant: Whether to use the thresholds of later passes.
+        keep_stationary: Whether to keep matches at the same pixel of both photos, which copies consist of.
     """
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = config.threads
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
+    verification.filter_stationary_matches = not keep_stationary
     if tolerant:
         options.sift.max_ratio = TOLERANT_RATIO
         verification.ransac.min_inlier_ratio = TOLERANT_INLIER_RATIO
