@@ -22,8 +22,9 @@ from wildgs.library.loaded import LoadedScene
 from wildgs.library.times import read_captures
 from wildgs.light.captures import Capture
 from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
-from wildgs.light.look import Timeline
+from wildgs.light.look import NEUTRAL, Timeline
 from wildgs.light.photos import MAX_PHOTOS, encode_view
+from wildgs.light.shadows import SunFinder
 from wildgs.light.sun import phase_of
 from wildgs.progress import Progress, counter
 from wildgs.scene import View
@@ -97,9 +98,11 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
 def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
+    finder = SunFinder(method, rows, loaded.appearance(NEUTRAL).sh)
     found = {}
     for number, view in enumerate(views, start=1):
-        found[view.name] = pattern_of(method.shade(encode_view(method, view)), rows)
+        appearance = encode_view(method, view)
+        found[view.name] = pattern_of(method.shade(appearance), rows, finder.direction(view, appearance))
         show(number, len(views))
     return found
 
