@@ -98,11 +98,12 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
 def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
-    finder = SunFinder(method, rows, loaded.appearance(NEUTRAL).sh)
+    finder = SunFinder(method.gaussians, method.sky(), rows, loaded.appearance(NEUTRAL).sh)
     found = {}
     for number, view in enumerate(views, start=1):
-        appearance = encode_view(method, view)
-        found[view.name] = pattern_of(method.shade(appearance), rows, finder.direction(view, appearance))
+        appearance, (photo, keep) = encode_view(method, view), view.load(rows.device)
+        sun = finder.direction(photo, view.camera, (keep, appearance.visibility))
+        found[view.name] = pattern_of(method.shade(appearance), rows, sun)
         show(number, len(views))
     return found
 

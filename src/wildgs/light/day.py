@@ -32,7 +32,7 @@ LEAST_PHOTOS = 5
 _COMPONENTS, _RIDGE = 8, 0.005
 """Number of principal components on which times are regressed, and ridge of the regression."""
 
-_PATTERN_RIDGE = 0.1
+_PATTERN_RIDGE = 0.02
 """Ridge of the regression of estimates on the unwhitened patterns, relative to their variance."""
 
 _PHOTOS_PER_COMPONENT = 4
@@ -157,7 +157,8 @@ def _rough_height(patterns: Sequence[Pattern]) -> Float[np.ndarray, " P"]:
     )
     lit_warmer = ((warmth - warmth.mean(axis=1, keepdims=True)) * luminance).mean(axis=1)
     colors = _ranks(-_ranks(warmth.mean(axis=1)) - _ranks(lit_warmer))
-    return _ranks(colors + _ranks(np.array([pattern.sun[2] for pattern in patterns])))
+    shadows = _ranks(np.array([pattern.sun[2] for pattern in patterns]))
+    return _ranks(colors + 2 * shadows)  # shadows are the better estimate (docs/decisions.md)
 
 
 def _ranks(values: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:

@@ -8,20 +8,19 @@ under its mean light, is taken to be that of the sun. Exposure and white balance
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from wildgs.geometry.camera import Camera
-from wildgs.model.appearance import Appearance
-from wildgs.model.method import Method
+from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Rendering, rasterize
-from wildgs.scene import View
 
-_ELEVATIONS, _AZIMUTHS = torch.arange(3.0, 88.0, 7.0), torch.arange(0.0, 360.0, 15.0)
-_MAP, _SIDE, _PIXELS = 256, 240, 3000
+_ELEVATIONS, _AZIMUTHS = torch.arange(4.0, 88.0, 8.0), torch.arange(0.0, 360.0, 20.0)
+_MAP, _SIDE, _PIXELS = 192, 240, 3000
 """Side of a shadow map, longest side of the images that are compared, and number of their pixels."""
 
 _DISTANCE = 30.0
@@ -45,15 +44,21 @@ class SunFinder:
     """Finds the direction of the sun in photos of one scene.
 
     Args:
-        method: The trained method.
+        gaussians: The Gaussians in the aligned frame.
+        sky: Mask of those that cast no shadow; None if there are none.
         rows: Gaussians that make up the scene; they determine the extent of the shadow maps.
         mean: Harmonics of all Gaussians under the mean light.
     """
 
     @torch.no_grad()
-    def __init__(self, method: Method, rows: Tensor, mean: Float[Tensor, "N K 3"]) -> None:
-        gaussians, sky = method.gaussians, method.sky()
-        opacities = gaussians.opacities.flatten()
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        sky: Bool[Tensor, " N"] | None,
+        rows: Int[Tensor, " R"],
+        mean: Float[Tensor, "N K 3"],
+    ) -> None:
+        opacities = gaussians.opacities
         self._shapes = (gaussians.means, gaussians.quats, gaussians.scales)
         self._opacities = opacities if sky is None else torch.where(sky, 0.0, opacities)
         self._mean = mean.contiguous()
@@ -86,35 +91,38 @@ class SunFinder:
         return rasterize(*self._shapes, self._opacities, self._mean, camera, sh_degree=degree)
 
     @torch.no_grad()
-    def direction(self, view: View, appearance: Appearance) -> Float[Tensor, "3"]:
+    def direction(
+        self, photo: Float[Tensor, "H W 3"], camera: Camera, masks: Sequence[Tensor | None] = ()
+    ) -> Float[Tensor, "3"]:
         """The mean of the likely directions of the sun in a photo; shorter than 1 if it is uncertain.
 
         Args:
-            view: The photo.
-            appearance: Its appearance, from `encode_view`.
+            photo: RGB in [0, 1].
+            camera: Camera of the photo.
+            masks: Images of any size; pixels where one of them is below 0.5 are ignored.
         """
-        weights = (self.correlations(view, appearance) / _TEMPERATURE).softmax(dim=0)
-        return weights @ self.directions
+        correlations = self._correlations(photo, camera, masks)
+        return (correlations / _TEMPERATURE).softmax(dim=0) @ self.directions
 
-    @torch.no_grad()
-    def correlations(self, view: View, appearance: Appearance) -> Float[Tensor, " D"]:
+    def _correlations(
+        self, photo: Float[Tensor, "H W 3"], camera: Camera, masks: Sequence[Tensor | None]
+    ) -> Float[Tensor, " D"]:
         """Correlation of a photo's brightness with the prediction for each direction; 0 if little is visible."""
         device = self._mean.device
-        size = (view.camera.width, view.camera.height)
+        size = (camera.width, camera.height)
         shrink = min(1.0, _SIDE / max(size))
-        camera = view.camera.resized(*(max(4, round(shrink * side)) for side in size)).to(device)
+        camera = camera.resized(*(max(4, round(shrink * side)) for side in size)).to(device)
         rendering = self._rasterize(camera)
         points = camera.unproject(rendering.depth)
         usable = (rendering.alpha > 0.9) & ((points - self._centre).norm(dim=-1) < 1.2 * self._radius)
-        photo, keep = view.load(device)
-        usable &= _static(appearance, keep, camera)
+        for mask in masks:
+            usable &= True if mask is None else _reduced(mask.float()[..., None], camera)[..., 0] > 0.5
         usable[[0, -1]], usable[:, [0, -1]] = False, False
         chosen = usable.flatten().nonzero()[:, 0]
         chosen = chosen[:: max(1, len(chosen) // _PIXELS)]
         if len(chosen) < 100:
             return torch.zeros(len(self.directions), device=device)
-        small = interpolate(photo.permute(2, 0, 1)[None], (camera.height, camera.width), mode="area")[0]
-        brightness = _log_luminance(small.permute(1, 2, 0)) - _log_luminance(rendering.colors)
+        brightness = _log_luminance(_reduced(photo, camera)) - _log_luminance(rendering.colors)
         brightness = brightness.flatten()[chosen]
         brightness = (brightness - brightness.median()).clamp(-1.5, 1.5)
         predicted = self._predictions(
@@ -153,14 +161,10 @@ def _log_luminance(colors: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     return (colors.clamp(0.02, 1.0) ** 2.2 @ colors.new_tensor([0.2126, 0.7152, 0.0722])).log()
 
 
-def _static(appearance: Appearance, keep: Bool[Tensor, "h w"] | None, camera: Camera) -> Bool[Tensor, "H W"]:
-    """Pixels of the reduced image that show the scene."""
-    static = torch.ones(camera.height, camera.width, dtype=torch.bool, device=camera.K.device)
-    for mask in (appearance.visibility, keep):
-        if mask is not None:
-            small = interpolate(mask.float()[None, None], (camera.height, camera.width), mode="area")[0, 0]
-            static &= small > 0.5
-    return static
+def _reduced(image: Float[Tensor, "h w C"], camera: Camera) -> Float[Tensor, "H W C"]:
+    """An image at the size of a camera, on its device."""
+    planes = image.to(camera.K.device).permute(2, 0, 1)[None]
+    return interpolate(planes, (camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
 
 
 def _normals(points: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "H W 3"]:
