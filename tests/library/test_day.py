@@ -17,11 +17,9 @@ import wildgs
 from wildgs.errors import UserError
 from wildgs.library import day as day_module
 from wildgs.library.config import TrajectoryOptions
-from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day
-from wildgs.library.times import read_captures
-from wildgs.light.captures import Capture
+from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day, read_captures
 from wildgs.light.day import plan_day
-from wildgs.scene.capture import carry_capture
+from wildgs.scene.capture import Capture, carry_capture
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from PIL.ExifTags import GPS, IFD, Base
 from PIL.PngImagePlugin import PngImageFile
 from scipy.stats import kendalltau
 
-from wildgs.light.captures import Capture, read_capture
 from wildgs.light.day import KEYS, LEAST_PHOTOS, Pattern, plan_day
 from wildgs.light.sun import phase_of, sun_position
+from wildgs.scene.capture import Capture, read_capture
 
 BERLIN = (52.5163, 13.3777)
 
