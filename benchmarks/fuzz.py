@@ -323,8 +323,8 @@ def _read_carried(folder: Path) -> object:
 
 def _read_exif(folder: Path) -> object:
     """As `wildgs sfm`, the viewer's uploads, `load_scene` and the order of a day read photos."""
-    from wildgs.light.captures import read_capture
     from wildgs.light.sun import phase_of
+    from wildgs.scene.capture import read_capture
     from wildgs.scene.images import read_photo
     from wildgs.sfm.upright import copy_upright
 

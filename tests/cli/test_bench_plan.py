@@ -10,7 +10,7 @@ import pytest
 
 from wildgs.config import RunConfig, differing_entries, with_entries, write_config
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.evaluation.published import PHOTOTOURISM, published_figures
+from wildgs.evaluation.benchmark_table import PHOTOTOURISM, published_figures
 from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant
 from wildgs.library.config import BENCH_METHODS, default_bench_methods, reference_preset
 from wildgs.model.registry import METHODS

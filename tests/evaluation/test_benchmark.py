@@ -8,8 +8,15 @@ import io
 import pytest
 
 from wildgs.evaluation.benchmark import MIXED, Row, Score, summarize
-from wildgs.evaluation.benchmark_table import legend, sections, to_csv, to_markdown, to_records
-from wildgs.evaluation.published import PHOTOTOURISM, published_figures
+from wildgs.evaluation.benchmark_table import (
+    PHOTOTOURISM,
+    legend,
+    published_figures,
+    sections,
+    to_csv,
+    to_markdown,
+    to_records,
+)
 
 LABELS = {"3dgs": "3DGS", "wildgs": "Wild-GS", "without-mask": "w/o Mask"}
 

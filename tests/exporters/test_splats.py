@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 
 from wildgs.exporters.splats import Splats
-from wildgs.geometry.camera import Camera
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import Camera, quats_to_rotations
 from wildgs.rasterize import rasterize
 from wildgs.scene import Alignment
 

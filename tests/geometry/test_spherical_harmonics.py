@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import quats_to_rotations
 from wildgs.geometry.spherical_harmonics import (
     fit_truncation,
     num_sh_bases,

@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
-from wildgs.light.captures import read_capture
-from wildgs.scene.capture import carry_capture
+from wildgs.scene.capture import carry_capture, read_capture
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from PIL.ExifTags import IFD, Base
 from tests.memory_views import make_view
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
-from wildgs.light.captures import read_capture
 from wildgs.scene import Alignment, DataConfig, Scene, load_scene
 from wildgs.scene import carried as module
+from wildgs.scene.capture import read_capture
 from wildgs.scene.carried import SCENE_FILE, carried_side, carry_scene, describe_carried, read_carried_scene
 from wildgs.scene.scene_record import SceneRecord
 

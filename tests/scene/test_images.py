@@ -187,11 +187,15 @@ def test_missing_files_and_giants_say_so(tmp_path: Path) -> None:
         read_photo(tmp_path / "a.png", max_pixels=900)
 
 
-def test_the_pixel_limit_is_ours_and_pillows_stays_untouched(tmp_path: Path) -> None:
-    limit = Image.MAX_IMAGE_PIXELS
-    Image.new("1", (20_000, 10_000)).save(tmp_path / "big.png")
-    assert read_mask(tmp_path / "big.png", (20, 10)).max() == 0  # Pillow alone refuses 200 megapixels
-    assert limit == Image.MAX_IMAGE_PIXELS
+def test_the_pixel_limit_is_ours_and_pillows_stays_untouched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.new("1", (200, 100)).save(tmp_path / "big.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5_000)
+    with pytest.raises(Image.DecompressionBombError):
+        Image.open(tmp_path / "big.png")
+    assert read_mask(tmp_path / "big.png", (20, 10)).max() == 0
+    assert Image.MAX_IMAGE_PIXELS == 5_000
 
 
 def test_masks_are_binary_by_majority(tmp_path: Path) -> None:

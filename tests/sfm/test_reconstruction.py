@@ -13,8 +13,8 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.light.captures import read_capture
 from wildgs.scene import DataConfig, load_scene
+from wildgs.scene.capture import read_capture
 from wildgs.scene.colmap import read_model
 from wildgs.sfm import matching, reconstruction
 from wildgs.sfm.config import PairingConfig, SfmConfig

@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wildgs.geometry.camera import Camera
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import Camera, quats_to_rotations
 from wildgs.viewer.cameras import camera_of, fov_that_holds, pose_of
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
 from wildgs.viewer.display import ENLARGED, colors_from, distances_from, splats_of
 

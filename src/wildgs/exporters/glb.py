@@ -17,8 +17,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from wildgs.errors import UserError
-from wildgs.exporters.lights import RelightableScene, SharedHarmonics
-from wildgs.exporters.thumbnail import thumbnail_url
+from wildgs.exporters.lights import RelightableScene, SharedHarmonics, thumbnail_url
 from wildgs.files import printable
 from wildgs.geometry.camera import Camera
 from wildgs.version import __version__

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from PIL import Image
 from torch import Tensor
 
 from wildgs.exporters.splats import Splats
@@ -161,3 +164,19 @@ def _picture_area(splats: Splats, viewpoints: Float[Tensor, "V 3"]) -> Float[Ten
     distance = torch.cdist(splats.means, viewpoints.to(splats.means)).median(dim=1).values.clamp_min(1e-6)
     longest = splats.scales.sort(dim=1, descending=True).values
     return (longest[:, 0] * longest[:, 1] / distance.square()).clamp_max(_MOST_AREA)
+
+
+THUMBNAIL = (288, 192)
+_QUALITY = 82
+
+
+def thumbnail_url(pixels: UInt8[np.ndarray, "H W 3"]) -> str:
+    """Centre crop of an image as a data URL."""
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    wide, tall = THUMBNAIL
+    scale = max(wide / image.width, tall / image.height)
+    left, top = (image.width - wide / scale) / 2, (image.height - tall / scale) / 2
+    box = (max(left, 0), max(top, 0), image.width - max(left, 0), image.height - max(top, 0))
+    buffer = io.BytesIO()
+    image.resize(THUMBNAIL, Image.Resampling.LANCZOS, box=box).save(buffer, "JPEG", quality=_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

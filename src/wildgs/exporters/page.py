@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from wildgs.exporters.lights import thumbnail_url
 from wildgs.exporters.page_scene import PackedScene, pack_scene
 from wildgs.exporters.splats import Splats
-from wildgs.exporters.thumbnail import thumbnail_url
 from wildgs.files import printable, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.exporters.lights import ExportLight, RelightableScene
+from wildgs.exporters.lights import ExportLight, RelightableScene, thumbnail_url
 from wildgs.exporters.splats import Splats
-from wildgs.exporters.thumbnail import thumbnail_url
 from wildgs.files import printable, written_aside
 from wildgs.version import __version__
 

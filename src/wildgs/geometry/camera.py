@@ -1,4 +1,4 @@
-"""Pinhole cameras in the OpenCV convention."""
+"""Pinhole cameras in the OpenCV convention, and rotations by quaternions."""
 
 from __future__ import annotations
 
@@ -92,3 +92,14 @@ class Camera:
         x = (x + 0.5 - self.K[0, 2]) / self.K[0, 0]
         y = (y + 0.5 - self.K[1, 2]) / self.K[1, 1]
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+
+def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Rotation matrices of quaternions (w, x, y, z), as in gsplat and COLMAP; they need not be normalised."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)

@@ -17,12 +17,11 @@ from wildgs.engine.distributed import assign_device
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
-from wildgs.evaluation.benchmark_table import to_csv, to_markdown, to_records
+from wildgs.evaluation.benchmark_table import LABELS as PUBLISHED_LABELS
+from wildgs.evaluation.benchmark_table import published_figures, to_csv, to_markdown, to_records
 from wildgs.evaluation.lpips import load_lpips
 from wildgs.evaluation.pictures import write_json
 from wildgs.evaluation.protocol import Protocol
-from wildgs.evaluation.published import LABELS as PUBLISHED_LABELS
-from wildgs.evaluation.published import published_figures
 from wildgs.files import check_regular, read_json, written_aside
 from wildgs.library.benchmark_plan import (
     PHOTOTOURISM_DOWNSCALE,

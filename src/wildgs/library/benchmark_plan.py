@@ -14,7 +14,7 @@ import yaml
 
 from wildgs.config import RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.evaluation.published import PHOTOTOURISM
+from wildgs.evaluation.benchmark_table import PHOTOTOURISM
 from wildgs.library.config import BENCH_METHODS, HALF, WITHOUT
 from wildgs.model.registry import METHODS, method_type
 from wildgs.presets import PRESETS, PresetName, with_preset

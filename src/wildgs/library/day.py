@@ -16,17 +16,19 @@ import torch
 from wildgs.errors import UserError
 from wildgs.evaluation.photos import find_misfits, read_photos
 from wildgs.exporters.page import choose_start
-from wildgs.files import read_json, written_aside
+from wildgs.files import is_file, read_json, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
-from wildgs.library.times import read_captures
-from wildgs.light.captures import Capture
 from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
-from wildgs.light.look import Timeline
+from wildgs.light.look import NEUTRAL, Timeline
 from wildgs.light.photos import MAX_PHOTOS, encode_view
+from wildgs.light.shadows import SunFinder
 from wildgs.light.sun import phase_of
 from wildgs.progress import Progress, counter
 from wildgs.scene import View
+from wildgs.scene.capture import Capture, read_capture
+from wildgs.scene.colmap import find_model
+from wildgs.scene.photo_store import with_ending
 
 DAY_FILE = "day.json"
 """Caches the day in the run folder; valid for one checkpoint."""
@@ -97,9 +99,12 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
 def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
+    finder = SunFinder(method.gaussians, method.sky(), rows, loaded.appearance(NEUTRAL).sh)
     found = {}
     for number, view in enumerate(views, start=1):
-        found[view.name] = pattern_of(method.shade(encode_view(method, view)), rows)
+        appearance, (photo, keep) = encode_view(method, view), view.load(rows.device)
+        sun = finder.direction(photo, view.camera, (keep, appearance.visibility))
+        found[view.name] = pattern_of(method.shade(appearance), rows, sun)
         show(number, len(views))
     return found
 
@@ -174,3 +179,52 @@ def day_timeline(
         show(number + 1, count)
     changes = [float((one - other).abs().mean()) for one, other in pairwise(pictures)]
     return timeline.paced(changes)
+
+
+def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, Capture]:
+    """Reads time and place of all photos that have EXIF data.
+
+    Args:
+        loaded: The run.
+        photos: Folder of the original photos, whose extensions may differ from those of the scene. None looks in
+            the run's scene folder (undistorted photos of `wildgs sfm` keep EXIF time and place) and at the copies
+            in the run folder.
+
+    Raises:
+        UserError: The folder `photos` does not exist.
+    """
+    originals = None if photos is None else _by_stem(photos)
+    folder = photos or _scene_photos(loaded)
+    found = {}
+    for view in loaded.views:
+        files = [folder and folder / view.name]
+        if originals is None:
+            files.append(view.photos.file(view.name))
+        else:
+            files.append(originals.get(with_ending(view.name, "")))
+        captures = (read_capture(file) for file in files if file is not None and is_file(file))
+        found[view.name] = next((capture for capture in captures if capture is not None), None)
+    return {name: capture for name, capture in found.items() if capture is not None}
+
+
+def _by_stem(photos: Path) -> dict[str, Path]:
+    """The files of a folder by relative path without extension."""
+    if not photos.is_dir():
+        raise UserError(f"{photos}: no such folder; give the folder of the original photos")
+    return {
+        with_ending(path.relative_to(photos).as_posix(), ""): path
+        for path in sorted(photos.rglob("*"))
+        if is_file(path)
+    }
+
+
+def _scene_photos(loaded: LoadedScene) -> Path | None:
+    try:
+        return find_model(Path(loaded.run.config.scene))[1]
+    except Exception:  # a run works without its scene folder
+        return None
+
+
+def read_times(loaded: LoadedScene) -> dict[str, str]:
+    """Local capture times in ISO 8601, by photo name."""
+    return {name: capture.local.isoformat() for name, capture in read_captures(loaded).items()}

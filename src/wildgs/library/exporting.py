@@ -20,11 +20,10 @@ from wildgs.exporters.splats import Splats, agreement, clean
 from wildgs.exporters.usd import write_usd
 from wildgs.files import written_aside
 from wildgs.library.config import ExportFormat, MixOptions
-from wildgs.library.day import viewpoints_of
+from wildgs.library.day import read_times, viewpoints_of
 from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.library.logs import logger
 from wildgs.library.pages import ExportedFile, baked, page_looks, thumbnail, write_webpage
-from wildgs.library.times import read_times
 from wildgs.light.look import NEUTRAL, Look
 from wildgs.model.gaussians import NEAR
 from wildgs.progress import Progress

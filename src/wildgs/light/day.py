@@ -2,8 +2,9 @@
 
 The luminance of every Gaussian relative to the scene's mean does not depend on exposure. It varies between photos
 mostly with the elevation of the sun: lit and shaded sides, long shadows, lamps. A regression for each scene
-predicts the elevation from it, trained on capture times if known, otherwise on rough statistics that hold for any
-scene (with a low sun, photos are warm, dark and of high contrast, and lit sides are warmer than shaded ones).
+predicts the elevation from it, trained on capture times if known, otherwise on two estimates that hold for any
+scene: the direction of the sun by shading and shadows (`wildgs.light.shadows`), and the colours (with a low sun,
+photos are warm, and lit sides are warmer than shaded ones).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import C0
@@ -28,11 +29,11 @@ KEYS = 9
 
 LEAST_PHOTOS = 5
 
-_ROUGH = (4, 0.1)
-_TIMED = (8, 0.005)
-"""Number of principal components, and ridge of the regression. Times are regressed on the components. Rough
-statistics are regressed on the unwhitened patterns, with a ridge relative to their variance; the components then
-only serve to find the side from which the sun shines."""
+_COMPONENTS, _RIDGE = 8, 0.005
+"""Number of principal components on which times are regressed, and ridge of the regression."""
+
+_PATTERN_RIDGE = 0.02
+"""Ridge of the regression of estimates on the unwhitened patterns, relative to their variance."""
 
 _PHOTOS_PER_COMPONENT = 4
 _LEAST_TIMED = 8
@@ -52,12 +53,12 @@ class Pattern:
     Attributes:
         luminance: Log luminance of some Gaussians minus its mean.
         warmth: Logarithm of red over blue of the same Gaussians.
-        level: The mean of the log luminance.
+        sun: Estimated direction of the sun in the aligned frame (`SunFinder.direction`).
     """
 
     luminance: Float[np.ndarray, " M"]
     warmth: Float[np.ndarray, " M"]
-    level: float
+    sun: Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
@@ -91,13 +92,13 @@ def visible_rows(method: Method, centres: Float[Tensor, "V 3"]) -> Tensor:
     return area.topk(min(GAUSSIANS, len(area))).indices
 
 
-def pattern_of(sh: Float[Tensor, "N K 3"], rows: Tensor) -> Pattern:
-    """The pattern of a light on the Gaussians with these indices."""
+def pattern_of(sh: Float[Tensor, "N K 3"], rows: Tensor, sun: Float[Tensor, "3"]) -> Pattern:
+    """The pattern of a light on the Gaussians with these indices, with the estimated direction of the sun."""
     shown = (0.5 + C0 * sh[rows, 0]).clamp(0.01, 1.2).double().cpu().numpy()
     linear = shown**2.2
     luminance = np.log(linear @ np.array([0.2126, 0.7152, 0.0722]))
-    level = float(luminance.mean())
-    return Pattern(luminance - level, np.log(linear[:, 0] / linear[:, 2]), level)
+    warmth = np.log(linear[:, 0] / linear[:, 2])
+    return Pattern(luminance - luminance.mean(), warmth, sun.double().cpu().numpy())
 
 
 def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day | None:
@@ -114,10 +115,10 @@ def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day
     if len(names) < LEAST_PHOTOS:
         return None
     luminance = np.stack([patterns[name].luminance for name in names])
+    axes = _components(luminance)
     timed = [index for index, name in enumerate(names) if name in times]
     if len(timed) >= _LEAST_TIMED:
         phases = np.array([times[names[index]] for index in timed])
-        axes = _components(luminance, _TIMED[0])
         kept, agreement = _consistent_times(axes[timed], NOON - np.abs(phases - NOON))
         if agreement >= _LEAST_AGREEMENT:
             left = {
@@ -127,23 +128,19 @@ def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day
             }
             chosen = [index for index, keep in zip(timed, kept, strict=True) if keep]
             return _day(names, axes, np.array(chosen), phases[kept], left, by_time=True)
-    axes = _components(luminance, _ROUGH[0])
-    height = _learn(_by_variance(luminance), _rough_height(list(patterns.values())), _ROUGH[1])
-    # The side of the sun, morning or evening, is taken to be the largest variation besides the elevation. Which of
-    # the two is the morning cannot be determined from light alone.
-    side = axes - np.outer(height, axes.T @ height / (height @ height))
-    rising = np.linalg.svd(side, full_matrices=False)[0][:, 0] < 0
+    known = list(patterns.values())
+    height = _learn(_by_variance(luminance), _rough_height(known), _PATTERN_RIDGE)
+    rising = _is_morning(np.stack([pattern.sun for pattern in known]))
     rank = (height.argsort().argsort() + 0.5) / len(names) * 180 - 90
     phases = np.where(rising, rank, 180 - rank)
     return _day(names, axes, np.arange(len(names)), phases, {}, by_time=False)
 
 
-def _components(luminance: Float[np.ndarray, "P M"], count: int) -> Float[np.ndarray, "P C"]:
+def _components(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P C"]:
     """Leading principal components of the patterns, each of unit variance."""
     centred = luminance - luminance.mean(axis=0)
-    count = max(2, min(count, len(luminance) // _PHOTOS_PER_COMPONENT))
-    left = np.linalg.svd(centred, full_matrices=False)[0][:, :count]
-    return left * np.sqrt(len(luminance))
+    count = max(2, min(_COMPONENTS, len(luminance) // _PHOTOS_PER_COMPONENT))
+    return np.linalg.svd(centred, full_matrices=False)[0][:, :count] * np.sqrt(len(luminance))
 
 
 def _by_variance(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P _"]:
@@ -154,20 +151,25 @@ def _by_variance(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P _"
 
 def _rough_height(patterns: Sequence[Pattern]) -> Float[np.ndarray, " P"]:
     """An estimate of the ranks of the sun's elevations, scaled to -0.5 to 0.5."""
-    luminance = np.stack([pattern.luminance for pattern in patterns])
-    warmth = np.stack([pattern.warmth for pattern in patterns])
-    warmth -= warmth.mean(axis=0)
-    varied = luminance - luminance.mean(axis=0)
-    contrast = varied.std(axis=1)
-    covariance = ((warmth - warmth.mean(axis=1, keepdims=True)) * varied).mean(axis=1)
-    level = np.array([pattern.level for pattern in patterns])
-    score = _scaled(level) - _scaled(warmth.mean(axis=1)) - _scaled(contrast) - _scaled(covariance)
-    return score.argsort().argsort() / len(score) - 0.5
+    luminance, warmth = (
+        np.stack(values) - np.mean(values, axis=0)
+        for values in ([each.luminance for each in patterns], [each.warmth for each in patterns])
+    )
+    lit_warmer = ((warmth - warmth.mean(axis=1, keepdims=True)) * luminance).mean(axis=1)
+    colors = _ranks(-_ranks(warmth.mean(axis=1)) - _ranks(lit_warmer))
+    shadows = _ranks(np.array([pattern.sun[2] for pattern in patterns]))
+    return _ranks(colors + 2 * shadows)  # shadows are the better estimate (docs/decisions.md)
 
 
-def _scaled(values: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    away = values - np.median(values)
-    return away / (np.abs(away).mean() + 1e-9)
+def _ranks(values: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    """Ranks of values, scaled to -0.5 to 0.5."""
+    return (values.argsort(kind="stable").argsort() + 0.5) / len(values) - 0.5
+
+
+def _is_morning(suns: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Whether the sun is to the left of its mean direction, as in the morning north of the tropics."""
+    mean = suns[:, :2].sum(axis=0)
+    return mean[0] * suns[:, 1] - mean[1] * suns[:, 0] > 0
 
 
 def _learn(
@@ -190,7 +192,7 @@ def _consistent_times(
     weights = np.ones(len(axes))
     error = np.zeros(len(axes))
     for _ in range(20):  # least absolute deviations, robust against wrong times
-        error = np.abs(heights - _learn(axes, heights, _TIMED[1], weights))
+        error = np.abs(heights - _learn(axes, heights, _RIDGE, weights))
         weights = 1 / np.maximum(error, 2.0)
     usual = 1.4826 * np.median(error)
     kept = error <= max(_DEVIATIONS * usual, _LEAST_ERROR)
@@ -200,7 +202,7 @@ def _consistent_times(
 def _cross_validated(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, " P"]) -> float:
     """Correlation between elevations and their leave-one-out predictions."""
     own = np.einsum("pc,cd,pd->p", axes, np.linalg.inv(axes.T @ axes + 1e-9 * np.eye(axes.shape[1])), axes)
-    error = (heights - _learn(axes, heights, _TIMED[1])) / np.maximum(1 - own - 1 / len(axes), 0.05)
+    error = (heights - _learn(axes, heights, _RIDGE)) / np.maximum(1 - own - 1 / len(axes), 0.05)
     predicted = heights - error
     if min(np.std(predicted), np.std(heights)) < 1e-9:
         return 0.0

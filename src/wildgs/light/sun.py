@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from datetime import UTC, datetime
 
-from wildgs.light.captures import Capture
+from wildgs.scene.capture import Capture
 
 NOON = 90.0
 """Phase of the day at noon."""

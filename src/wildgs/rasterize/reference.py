@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from wildgs.geometry.camera import Camera
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import Camera, quats_to_rotations
 from wildgs.geometry.spherical_harmonics import num_sh_bases, sh_basis
 from wildgs.rasterize.interface import (
     MAX_ALPHA,

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import quats_to_rotations
 from wildgs.scene.colmap_binary import read_binary
 from wildgs.scene.colmap_records import ImageRecord, ModelFileError, ModelRecords, PointRecords
 from wildgs.scene.colmap_text import read_text

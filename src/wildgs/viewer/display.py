@@ -11,8 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from wildgs.exporters.depth_colors import color_depth
-from wildgs.geometry.camera import Camera
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import Camera, quats_to_rotations
 from wildgs.light.look import Look
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import sh_to_colors

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from wildgs.engine.density.control import DensityControl, DensityReport, SeenView, ViewStatistics
 from wildgs.engine.optimizers import edit_rows
-from wildgs.geometry.rotation import quats_to_rotations
+from wildgs.geometry.camera import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Projection, blend
 
