@@ -42,6 +42,19 @@ install_import_hook(_modules_to_check(), "beartype.beartype")
 pytest_plugins = ["tests.scene_files"]
 
 
+@pytest.fixture(autouse=True)
+def few_suns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shadow maps of few directions, for speed; tests/light/test_shadows.py has all of them."""
+    if request.module.__name__.endswith("test_shadows"):
+        return
+    import torch
+
+    from wildgs.light import shadows
+
+    monkeypatch.setattr(shadows, "_ELEVATIONS", torch.tensor([10.0, 50.0]))
+    monkeypatch.setattr(shadows, "_AZIMUTHS", torch.tensor([0.0, 120.0, 240.0]))
+
+
 def _missing(marker: str) -> str | None:
     if marker == "shared" and not (SHARED / "data").is_dir():
         return "no ../shared folder beside the checkout"

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
@@ -19,7 +18,6 @@ from wildgs.errors import UserError
 from wildgs.library import day as day_module
 from wildgs.library.config import TrajectoryOptions
 from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day, read_captures
-from wildgs.light import shadows
 from wildgs.light.day import plan_day
 from wildgs.scene.capture import Capture, carry_capture
 
@@ -27,13 +25,6 @@ from wildgs.scene.capture import Capture, carry_capture
 @pytest.fixture(scope="module")
 def run(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(trained, tmp_path_factory.mktemp("day") / "run"))
-
-
-@pytest.fixture(autouse=True)
-def few_suns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shadow maps of few directions, for speed; tests/light/test_shadows.py has all of them."""
-    monkeypatch.setattr(shadows, "_ELEVATIONS", torch.tensor([10.0, 50.0]))
-    monkeypatch.setattr(shadows, "_AZIMUTHS", torch.tensor([0.0, 120.0, 240.0]))
 
 
 def test_a_day_is_found_once_and_kept(run: Path) -> None:
