@@ -94,6 +94,20 @@ def make_landmark(
     (output / "split.tsv").write_text("filename\tid\tsplit\tdataset\n" + "".join(rows), encoding="utf-8")
 
 
+def find_lights(config: SyntheticConfig) -> dict[str, Light]:
+    """The true light of each photo, by its name in the scene."""
+    place = _build_place()
+    return {f"landmark_{i:02d}.jpg": _begin_photo(i, place, config)[1] for i in range(config.photos)}
+
+
+def _begin_photo(
+    index: int, place: _Place, config: SyntheticConfig
+) -> tuple[Viewpoint, Light, np.random.Generator]:
+    rng = np.random.default_rng([config.seed, 1, index])
+    view = _choose_view(index, place, config, rng)
+    return view, draw_light(_LIGHTS[(index + index // len(_LIGHTS)) % len(_LIGHTS)], rng), rng
+
+
 def _split(index: int, config: SyntheticConfig) -> str:
     return "test" if index % config.test_every == config.test_every // 2 else "train"
 
@@ -124,9 +138,7 @@ def _choose_view(index: int, place: _Place, config: SyntheticConfig, rng: np.ran
 
 def _take_photo(index: int, place: _Place, config: SyntheticConfig, output: Path) -> Photo:
     """Renders and writes one photo with its depth prior, mask and (for a test photo) clean truth."""
-    rng = np.random.default_rng([config.seed, 1, index])
-    view = _choose_view(index, place, config, rng)
-    light = draw_light(_LIGHTS[(index + index // len(_LIGHTS)) % len(_LIGHTS)], rng)
+    view, light, rng = _begin_photo(index, place, config)
     visitors = draw_visitors(view, lambda x, y, radius: is_free(place.whole, x, y, radius), rng)
     response = draw_response(rng, dark=light.lamps > 0.0)
 

@@ -1,0 +1,92 @@
+"""Are lights in the order of the day? Kendall's tau of the demo's photos against the true directions of the sun.
+
+    python benchmarks/day_order.py wildgs-demo/wildgs                      from light alone
+    python benchmarks/day_order.py wildgs-demo/wildgs --clocks             with the true hours in EXIF blocks
+    python benchmarks/day_order.py wildgs-demo/wildgs --clocks --wrong 5   five clocks 8 to 12 hours off
+
+The run must be of the demo's scene, or of one that `python -m demo_generator` made with another `--seed`. By
+elevation, morning and evening are the same; by phase, the sun rises from 0 to 90 and sets to 180 degrees. Without
+`--clocks`, the order that the run folder keeps (`day.json`) is used if there is one.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+from scipy.stats import kendalltau
+
+import wildgs
+from demo_generator.lighting import Light
+from demo_generator.photos import SyntheticConfig, find_lights
+from wildgs.library.day import find_day
+from wildgs.library.loaded import LoadedScene
+from wildgs.light.day import Day
+
+
+@dataclass(frozen=True)
+class Command:
+    """Compares the order of a day with the truth."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder."""
+    clocks: bool = False
+    """Write the true hours into EXIF blocks of copies of the photos."""
+    wrong: int = 0
+    """Number of these clocks that are wrong."""
+    seed: int = 0
+    """Seed of the scene's generator."""
+
+
+def phase_of(light: Light) -> float:
+    """Height of the sun along its path, degrees; the landmark's front looks south, so that +x is the east."""
+    return light.elevation if light.azimuth > 0 else 180 - light.elevation
+
+
+def write_clocks(scene: LoadedScene, lights: dict[str, Light], folder: Path, wrong: int) -> list[str]:
+    """Copies the training photos with EXIF times; returns those whose clocks are wrong."""
+    random = np.random.default_rng(5)
+    names = [view.name for view in scene.scene.train_views]
+    chosen = list(random.choice(names, wrong, replace=False))
+    for view in scene.scene.train_views:
+        hour = (phase_of(lights[view.name]) + 90) / 15
+        hour = (hour + random.choice([8, 10, 12, -9])) % 24 if view.name in chosen else hour
+        exif = Image.Exif()
+        exif.get_ifd(IFD.Exif)[Base.DateTimeOriginal] = (
+            f"2019:07:01 {int(hour):02d}:{int(hour % 1 * 60):02d}:00"
+        )
+        Image.fromarray(view.read_photo().numpy()).save(folder / view.name, exif=exif)
+    return chosen
+
+
+def report(title: str, names: Iterable[str], day: Day, lights: dict[str, Light]) -> None:
+    found = np.array([day.phases[name] for name in names])
+    true = np.array([phase_of(lights[name]) for name in names])
+    height = [90 - np.abs(90 - phases) for phases in (found, true)]
+    sides = float(((found < 90) == (true < 90)).mean())
+    print(
+        f"{title}: {len(found)} photos, tau of elevation {kendalltau(*height)[0]:.3f}, "
+        f"of phase {kendalltau(found, true)[0]:.3f}, morning or evening right for {sides:.0%}"
+    )
+
+
+def main(command: Command) -> None:
+    lights = find_lights(SyntheticConfig(seed=command.seed))
+    scene = wildgs.load(command.run)
+    with tempfile.TemporaryDirectory() as folder:
+        wrong = write_clocks(scene, lights, Path(folder), command.wrong) if command.clocks else []
+        day = find_day(scene, Path(folder) if command.clocks else None)
+    if command.clocks:
+        print(f"wrong clocks: {sorted(wrong)}; left out: {sorted(day.left_out)}")
+    report("all", list(day.phases), day, lights)
+    report("keys", list(day.keys), day, lights)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Command))
