@@ -5,7 +5,7 @@
     python benchmarks/day_order.py wildgs-demo/wildgs --clocks --wrong 5   five clocks 8 to 12 hours off
 
 The run must be of the demo's scene, or of one that `demo_generator.photos.make_landmark` renders with another seed.
-By elevation, morning and evening are the same; by phase, the sun rises from 0 to 90 and sets to 180 degrees. Without
+By elevation, morning and evening are the same; by phase, the sun rises to 90 and sets to 180 degrees. Without
 `--clocks`, the order that the run folder keeps (`day.json`) is used if there is one.
 """
 

@@ -20,7 +20,7 @@ from wildgs.files import is_file, read_json, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
 from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
-from wildgs.light.look import NEUTRAL, Timeline
+from wildgs.light.look import Timeline
 from wildgs.light.photos import MAX_PHOTOS, encode_view
 from wildgs.light.shadows import SunFinder
 from wildgs.light.sun import phase_of
@@ -99,13 +99,19 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
 def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
-    finder = SunFinder(method.gaussians, method.sky(), rows, loaded.appearance(NEUTRAL).sh)
-    found = {}
+    mean, lights, masks = torch.tensor(0.0), [], []
     for number, view in enumerate(views, start=1):
-        appearance, (photo, keep) = encode_view(method, view), view.load(rows.device)
-        sun = finder.direction(photo, view.camera, (keep, appearance.visibility))
-        found[view.name] = pattern_of(method.shade(appearance), rows, sun)
+        appearance = encode_view(method, view)
+        sh = method.shade(appearance)
+        mean = sh / len(views) if number == 1 else mean.add_(sh, alpha=1 / len(views))
+        lights.append(sh[rows])
+        masks.append(appearance.visibility)
         show(number, len(views))
+    finder = SunFinder(method.gaussians, method.sky(), rows, mean)
+    found = {}
+    for view, sh, mask in zip(views, lights, masks, strict=True):
+        photo, keep = view.load(rows.device)
+        found[view.name] = pattern_of(sh, finder.direction(photo, view.camera, (keep, mask)))
     return found
 
 

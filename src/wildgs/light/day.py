@@ -92,9 +92,9 @@ def visible_rows(method: Method, centres: Float[Tensor, "V 3"]) -> Tensor:
     return area.topk(min(GAUSSIANS, len(area))).indices
 
 
-def pattern_of(sh: Float[Tensor, "N K 3"], rows: Tensor, sun: Float[Tensor, "3"]) -> Pattern:
-    """The pattern of a light on the Gaussians with these indices, with the estimated direction of the sun."""
-    shown = (0.5 + C0 * sh[rows, 0]).clamp(0.01, 1.2).double().cpu().numpy()
+def pattern_of(sh: Float[Tensor, "M K 3"], sun: Float[Tensor, "3"]) -> Pattern:
+    """The pattern of a light on some Gaussians (`visible_rows`), with the estimated direction of the sun."""
+    shown = (0.5 + C0 * sh[:, 0]).clamp(0.01, 1.2).double().cpu().numpy()
     linear = shown**2.2
     luminance = np.log(linear @ np.array([0.2126, 0.7152, 0.0722]))
     warmth = np.log(linear[:, 0] / linear[:, 2])
