@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.photos import find_misfits, read_photos
@@ -22,7 +24,7 @@ from wildgs.library.loaded import LoadedScene
 from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
 from wildgs.light.look import Timeline
 from wildgs.light.photos import MAX_PHOTOS, encode_view
-from wildgs.light.shadows import SunFinder
+from wildgs.light.shadows import SIDE, SunFinder
 from wildgs.light.sun import phase_of
 from wildgs.progress import Progress, counter
 from wildgs.scene import View
@@ -99,13 +101,13 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
 def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
-    mean, lights, masks = torch.tensor(0.0), [], []
+    mean, lights, masks = torch.zeros((), device=rows.device), [], []
     for number, view in enumerate(views, start=1):
         appearance = encode_view(method, view)
         sh = method.shade(appearance)
-        mean = sh / len(views) if number == 1 else mean.add_(sh, alpha=1 / len(views))
+        mean = mean + sh / len(views)
         lights.append(sh[rows])
-        masks.append(appearance.visibility)
+        masks.append(None if appearance.visibility is None else _small(appearance.visibility))
         show(number, len(views))
     finder = SunFinder(method.gaussians, method.sky(), rows, mean)
     found = {}
@@ -185,6 +187,12 @@ def day_timeline(
         show(number + 1, count)
     changes = [float((one - other).abs().mean()) for one, other in pairwise(pictures)]
     return timeline.paced(changes)
+
+
+def _small(mask: Float[Tensor, "H W"]) -> Float[Tensor, "h w"]:
+    """Every n-th pixel, since the masks of all photos are in memory at once."""
+    step = max(1, max(mask.shape) // SIDE)
+    return mask[::step, ::step].clone()
 
 
 def read_captures(loaded: LoadedScene, photos: Path | None = None) -> dict[str, Capture]:

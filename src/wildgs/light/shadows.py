@@ -20,8 +20,11 @@ from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import Rendering, rasterize
 
 _ELEVATIONS, _AZIMUTHS = torch.arange(4.0, 88.0, 8.0), torch.arange(0.0, 360.0, 20.0)
-_MAP, _SIDE, _PIXELS = 192, 240, 3000
-"""Side of a shadow map, longest side of the images that are compared, and number of their pixels."""
+SIDE = 240
+"""Longest side of the images that are compared."""
+
+_MAP, _PIXELS = 192, 3000
+"""Side of a shadow map, and number of pixels that are compared."""
 
 _DISTANCE = 30.0
 """Distance of the cameras of the shadow maps, in units of the scene's radius."""
@@ -110,7 +113,7 @@ class SunFinder:
         """Correlation of a photo's brightness with the prediction for each direction; 0 if little is visible."""
         device = self._mean.device
         size = (camera.width, camera.height)
-        shrink = min(1.0, _SIDE / max(size))
+        shrink = min(1.0, SIDE / max(size))
         camera = camera.resized(*(max(4, round(shrink * side)) for side in size)).to(device)
         rendering = self._rasterize(camera)
         points = camera.unproject(rendering.depth)
