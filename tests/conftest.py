@@ -20,9 +20,17 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 for _name, _value in LIBRARY_DEFAULTS.items():
     os.environ.setdefault(_name, _value)
 
-# Under nohup, and in some runners, processes that tests start would inherit that SIGHUP is ignored.
+# Under nohup and in the background of a script, processes that tests start would ignore these signals.
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Workers of pytest-xdist share the cores; set before torch and the processes that tests start read it.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "WILDGS_NUM_THREADS"):
+        os.environ[_name] = str(_threads)
 
 SOURCE = Path(__file__).parent.parent / "src"
 SHARED = Path(__file__).parents[2] / "shared"
@@ -53,6 +61,20 @@ def few_suns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(shadows, "_ELEVATIONS", torch.tensor([10.0, 50.0]))
     monkeypatch.setattr(shadows, "_AZIMUTHS", torch.tensor([0.0, 120.0, 240.0]))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Runs the whole suite in one process per core, at most four, if pytest-xdist is installed and no `-n` is given.
+
+    Parts of the suite run in this process: each worker has to import everything and to make its own fixtures.
+    """
+    whole = config.args_source != pytest.Config.ArgsSource.ARGS
+    if whole and config.pluginmanager.hasplugin("xdist") and not config.option.usepdb:
+        if config.option.numprocesses is None:
+            config.option.numprocesses = min(os.cpu_count() or 1, 4)
+        if config.option.dist == "no":
+            config.option.dist = "loadfile"
 
 
 def _missing(marker: str) -> str | None:
