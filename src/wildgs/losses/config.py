@@ -16,7 +16,7 @@ class ObjectiveConfig:
         mask_weight_end: λ^M at the last step; linear in between.
         mask_weight_photos: Number of training photos from which on λ^M starts at `mask_weight_start`. With fewer
             photos it starts lower (at `mask_weight_end` with two thirds as many), because a few photos are
-            memorised, including passers-by, before a reluctant mask has found them. 0 disables this. Not in the
+            memorised, including passers-by, before the mask has found them. 0 disables this. Not in the
             paper.
         mask_power: Exponent of M in the image loss (paper: 1). Above 1, pixels that the mask is unsure of have
             little weight.
@@ -24,7 +24,7 @@ class ObjectiveConfig:
         metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
         mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
             'evidence': a robust measure of how transient a pixel is
-            (`wildgs.losses.photometric.transient_evidence`). Neither changes the loss nor its gradient to the
+            (`wildgs.losses.evidence.transient_evidence`). Neither changes the loss nor its gradient to the
             render.
         min_alpha: Smallest accumulated alpha of a pixel that enters the depth loss.
     """

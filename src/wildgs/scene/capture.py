@@ -78,7 +78,7 @@ def read_capture(file: Path) -> Capture | None:
         # Not `DateTime`, which is the time of the last change of the file.
         stamp = details.get(Base.DateTimeOriginal) or details.get(Base.DateTimeDigitized)
         local = datetime.strptime(str(stamp).strip("\0 "), _TIME)
-        return Capture(local, _utc(gps) or _zoned(local, details), _place(gps))
+        return Capture(local, _utc(gps) or _zoned(local, details), read_place(gps))
     except Exception:  # EXIF data of photos from the internet may be malformed in any way
         return None
 
@@ -102,7 +102,8 @@ def _zoned(local: datetime, details: dict) -> datetime | None:
         return None
 
 
-def _place(gps: dict) -> tuple[float, float] | None:
+def read_place(gps: dict) -> tuple[float, float] | None:
+    """Latitude and longitude in degrees from the GPS entries of EXIF data; None if missing or invalid."""
     try:
         latitude, longitude = (
             sum(float(part) / 60**power for power, part in enumerate(gps[tag]))

@@ -15,8 +15,10 @@ from PIL import Image
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_file, is_unprintable, printable
 from wildgs.progress import Counter, in_threads
+from wildgs.scene.capture import read_place
 from wildgs.scene.colmap import describe_names
 from wildgs.scene.config import MAX_IMAGE_PIXELS
+from wildgs.scene.image_cache import DECODERS
 from wildgs.scene.images import (
     EXIF_ORIENTATION,
     UnreadableImageError,
@@ -34,8 +36,6 @@ MAX_NAME_BYTES = 240
 """Longest name of a photo in the scene; masks add an extension, and file systems allow 255 bytes."""
 JPEG_QUALITY = 97
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
-COPIERS = 4
-"""Number of threads that decode and copy; Pillow releases the GIL."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def copy_upright(
         return WorkingCopy(name, work_name, scene_name, masked, position)
 
     copies, broken = [], {}
-    for name, result in zip(names, in_threads(copy, plans, COPIERS, progress), strict=True):
+    for name, result in zip(names, in_threads(copy, plans, DECODERS, progress), strict=True):
         if isinstance(result, str):
             broken[name] = result
             text = f"{printable(str(folder / name))}: {result}; the photo is left out"
@@ -188,7 +188,7 @@ def _copy_one(
     """Copies one photo; returns whether a mask was written, and the GPS position."""
     with open_image(source, max_pixels) as image, decoding(image):
         photo = read_photo(source, max_pixels=max_pixels)
-        position = gps_position(image)
+        position = _gps_position(image)
         if image.format == "JPEG" and image.mode == "RGB" and _orientation(image) == 1:
             shutil.copyfile(source, target)  # lossless
             return False, position
@@ -200,23 +200,12 @@ def _copy_one(
     return True, position
 
 
-def gps_position(image: Image.Image) -> tuple[float, float] | None:
-    """GPS latitude and longitude in degrees from EXIF data; None if missing or invalid.
-
-    COLMAP only reads positions with an altitude.
-    """
+def _gps_position(image: Image.Image) -> tuple[float, float] | None:
+    """GPS latitude and longitude in degrees; COLMAP only reads positions with an altitude."""
     try:
-        gps = image.getexif().get_ifd(GPS_IFD)
-        latitude, longitude = (
-            sum(float(part) / unit for part, unit in zip(gps[tag], (1, 60, 3600), strict=True))
-            for tag in (2, 4)
-        )
-        latitude *= -1 if str(gps[1]).upper().startswith("S") else 1
-        longitude *= -1 if str(gps[3]).upper().startswith("W") else 1
-    except Exception:  # missing or invalid
+        return read_place(image.getexif().get_ifd(GPS_IFD))
+    except Exception:  # EXIF data may be malformed in any way
         return None
-    valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0.0, 0.0)
-    return (latitude, longitude) if valid else None
 
 
 def save_jpeg(picture: Image.Image, original: Image.Image, target: Path) -> None:
