@@ -6,6 +6,8 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -65,9 +67,10 @@ def few_suns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Runs the whole suite in one process per core, at most four, if pytest-xdist is installed and no `-n` is given.
+    """Runs the whole suite in one process per core, at most four, where pytest-xdist is installed.
 
-    Parts of the suite run in this process: each worker has to import everything and to make its own fixtures.
+    Parts of the suite run in this process: each worker has to import everything and to make its own fixtures. `-n`
+    overrides this.
     """
     whole = config.args_source != pytest.Config.ArgsSource.ARGS
     if whole and config.pluginmanager.hasplugin("xdist") and not config.option.usepdb:
@@ -116,6 +119,24 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("may not mount a file system here; injected failures stand in for it elsewhere")
     yield disk
     subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.fixture(scope="session")
+def forking_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A Python that starts at once (Linux)."""
+    if sys.platform != "linux":
+        pytest.skip("needs bash and /proc")
+    folder, root = tmp_path_factory.mktemp("python"), SOURCE.parent
+    places = os.pathsep.join(map(str, (SOURCE, root / "benchmarks", root)))
+    environment = os.environ | {"PYTHONPATH": places, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    script = Path(__file__).with_name("forking_python.py")
+    server = subprocess.Popen([sys.executable, str(script), str(folder)], env=environment)
+    while not (folder / "python").exists():
+        assert server.poll() is None
+        time.sleep(0.05)
+    yield folder / "python"
+    server.kill()
+    server.wait()
 
 
 TRAIN = (

@@ -7,8 +7,6 @@ import os
 import subprocess
 import sys
 import tarfile
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,30 +33,14 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A Python that starts at once."""
-    folder = tmp_path_factory.mktemp("python")
-    places = os.pathsep.join([str(ROOT / "src"), str(ROOT / "benchmarks"), str(ROOT)])
-    environment = os.environ | {"PYTHONPATH": places, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, str(Path(__file__).with_name("forking_python.py")), str(folder)]
-    server = subprocess.Popen(command, env=environment)
-    while not (folder / "python").exists():
-        assert server.poll() is None
-        time.sleep(0.05)
-    yield folder / "python"
-    server.kill()
-    server.wait()
-
-
 def call(python: Path, output: Path, *options: Any) -> subprocess.CompletedProcess[str]:
     command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), "--output", str(output), *map(str, options)]
     environment = os.environ | {"PYTHON": str(python), "STEPS": "4", "WILDGS_LPIPS": "off"}
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=800)
 
 
-def test_every_stage_runs_and_leaves_its_result(python: Path, landmark: Path, tmp_path: Path):
-    done = call(python, tmp_path, "--dry-run", "--scene", landmark, *STAGES)
+def test_every_stage_runs_and_leaves_its_result(forking_python: Path, landmark: Path, tmp_path: Path):
+    done = call(forking_python, tmp_path, "--dry-run", "--scene", landmark, *STAGES)
     report = json.loads((tmp_path / "gpu.json").read_text(encoding="utf-8"))
     codes = {stage["stage"]: stage["exit_code"] for stage in report["stages"]}
     logs = {path.stem: path.read_text()[-600:] for path in (tmp_path / "parts").glob("*.log")}
@@ -76,16 +58,16 @@ def test_every_stage_runs_and_leaves_its_result(python: Path, landmark: Path, tm
         assert {"gpu.json", "parts/stages.jsonl", "parts/steps.out"} <= set(archive.getnames())
 
 
-def test_earlier_stages_leave_time_to_training(python: Path, tmp_path: Path):
+def test_earlier_stages_leave_time_to_training(forking_python: Path, tmp_path: Path):
     """A budget that is smaller than what training reserves goes to training alone, and every stage says so."""
-    done = call(python, tmp_path, "--dry-run", "--budget", 100, "build", "eager")
+    done = call(forking_python, tmp_path, "--dry-run", "--budget", 100, "build", "eager")
     assert done.returncode == 0, done.stderr
     lines = (tmp_path / "parts" / "stages.jsonl").read_text().splitlines()
     assert [json.loads(line)["exit_code"] for line in lines] == [124, 124]
 
 
-def test_an_unknown_stage_is_named(python: Path, tmp_path: Path):
-    done = call(python, tmp_path, "--dry-run", "fly")
+def test_an_unknown_stage_is_named(forking_python: Path, tmp_path: Path):
+    done = call(forking_python, tmp_path, "--dry-run", "fly")
     assert done.returncode == 2
     assert "unknown stage fly" in done.stderr
 

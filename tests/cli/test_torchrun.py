@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -40,6 +41,18 @@ def torchrun(*arguments: object) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def torchrun_to_the_end(python: Path, folder: Path, *arguments: object) -> tuple[int, str, str]:
+    """Exit code, output and errors of two processes of a Python that starts at once."""
+    environment = os.environ | {"PYTHONPATH": str(SOURCE), "WILDGS_NUM_THREADS": "1", "NO_COLOR": "1"}
+    environment["PYTHON_EXEC"] = str(python)  # torchrun starts ranks with it
+    # Files, because a rank that torchrun stops early keeps its output open for a while.
+    logs = Path(tempfile.mkdtemp(dir=folder))
+    with (logs / "output").open("a") as output, (logs / "errors").open("a") as errors:
+        command = [*LAUNCH, *map(str, arguments)]
+        code = subprocess.run(command, env=environment, stdout=output, stderr=errors, check=False).returncode
+    return code, (logs / "output").read_text(), (logs / "errors").read_text()
 
 
 def wait_for_checkpoint(process: subprocess.Popen[str], run: Path, beyond: int) -> None:
@@ -100,10 +113,10 @@ def test_stop_then_lose_a_rank_then_go_on_alone(landmark: Path, tmp_path: Path, 
     assert steps[-1] == 400
 
 
-def test_a_mistake_is_told_once(tmp_path: Path) -> None:
-    process = torchrun("train", tmp_path / "nowhere", "--output", tmp_path / "run", *TRAIN)
-    errors = process.communicate()[1]
-    assert process.returncode != 0
+def test_a_mistake_is_told_once(forking_python: Path, tmp_path: Path) -> None:
+    options = ("train", tmp_path / "nowhere", "--output", tmp_path / "run", *TRAIN)
+    code, _, errors = torchrun_to_the_end(forking_python, tmp_path, *options)
+    assert code != 0
     (line,) = told(errors)
     assert line.startswith("error: ")
     assert "nowhere" in line
@@ -113,13 +126,15 @@ def test_a_mistake_is_told_once(tmp_path: Path) -> None:
 BENCH = ("--steps", "4", "--methods", "3dgs")
 
 
-def test_bench_spreads_its_runs_and_tells_once_what_failed(landmark: Path, tmp_path: Path) -> None:
+def test_bench_spreads_its_runs_and_tells_once_what_failed(
+    forking_python: Path, landmark: Path, tmp_path: Path
+) -> None:
     obstacle = tmp_path / landmark.name / "3dgs" / "seed_1" / "checkpoints"
     obstacle.parent.mkdir(parents=True)
     obstacle.write_text("in the way")
-    process = torchrun("bench", landmark, "--output", tmp_path, "--seeds", "0", "1", "2", *BENCH)
-    output, errors = process.communicate()
-    assert process.returncode != 0
+    bench = ("bench", landmark, "--output", tmp_path, "--seeds", "0", "1", "2", *BENCH)
+    code, output, errors = torchrun_to_the_end(forking_python, tmp_path, *bench)
+    assert code != 0
     (line,) = told(errors)
     assert "1 of 3 runs failed" in line
     speakers = [line.split(":")[0] for line in output.splitlines() if ": run " in line]
@@ -128,9 +143,8 @@ def test_bench_spreads_its_runs_and_tells_once_what_failed(landmark: Path, tmp_p
     assert finished_seeds(tmp_path) == [0, 2]
 
     obstacle.unlink()
-    again = torchrun("bench", landmark, "--output", tmp_path, "--seeds", "0", "1", "2", *BENCH)
-    output, errors = again.communicate()
-    assert again.returncode == 0, errors
+    code, output, errors = torchrun_to_the_end(forking_python, tmp_path, *bench)
+    assert code == 0, errors
     (only,) = runs_of(output)
     assert only.startswith("2 of 3")
     assert finished_seeds(tmp_path) == [0, 1, 2]

@@ -25,12 +25,13 @@ SOURCE = Path(__file__).parents[2] / "src"
 
 
 @pytest.fixture(scope="module")
-def ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def ranks(tmp_path_factory: pytest.TempPathFactory, forking_python: Path) -> Path:
     """The folder into which two processes wrote what they computed."""
     output = tmp_path_factory.mktemp("ranks")
     launcher = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     places = os.pathsep.join([str(SOURCE), str(SOURCE.parent)])  # the package, and helpers of other tests
     environment = os.environ | {"PYTHONPATH": places, "WILDGS_NUM_THREADS": "1"}
+    environment["PYTHON_EXEC"] = str(forking_python)  # torchrun starts ranks with it
     result = subprocess.run(
         [*launcher, str(SCRIPT), str(output)], env=environment, capture_output=True, text=True, check=False
     )

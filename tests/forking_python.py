@@ -1,8 +1,9 @@
-"""A Python that has torch imported already and forks for every command; test_gpu_script gives it to gpu.sh.
+"""A Python that has torch imported already and forks for every command; the fixture of this name starts it.
 
     python forking_python.py FOLDER         serves FOLDER/python, which takes Python's command line
 
-Each process of its own would import torch, Numba and the package first, which takes longer than a tiny stage does.
+Each process of its own would import torch, Numba and the package first, which takes longer than a tiny training.
+Signals reach the client only, not the fork.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ exit "$code"
 
 def execute(arguments: list[str]) -> None:
     """Does what Python does with a command line."""
+    if arguments[0] == "-u":
+        arguments = arguments[1:]
     kind, *rest = arguments
     if kind == "-m":
         # Pytest warns where it cannot rewrite the assertions of what is imported already.
@@ -37,6 +40,7 @@ def execute(arguments: list[str]) -> None:
         exec(compile(code, "<string>", "exec"), {"__name__": "__main__"})
     else:
         sys.argv = arguments
+        sys.path.insert(0, str(Path(kind).parent))
         runpy.run_path(kind, run_name="__main__")
 
 
