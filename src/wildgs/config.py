@@ -21,7 +21,10 @@ from wildgs.files import check_regular, written_aside
 from wildgs.model.registry import DEFAULT_METHOD, MethodName, config_type
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
+CONFIG_FILE = "config.yaml"
 MAX_CONFIG_BYTES = 1_000_000
+BUDGET = "train.density.max_gaussians"
+"""The only entry that may change when a run is resumed, since it depends on the machine's memory."""
 
 _BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
 """First and last line, to detect truncation: a truncated file could still be valid YAML with entries missing."""

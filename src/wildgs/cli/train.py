@@ -13,7 +13,7 @@ import tyro
 
 from wildgs.cli.options import UNNAMED, option_name
 from wildgs.cli.screen import console, progress_shown
-from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
+from wildgs.config import BUDGET, CONFIG_FILE, ExecutionConfig, RunConfig, differing_entries, read_config
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, config_type
@@ -24,8 +24,6 @@ from wildgs.viewer.config import ServerConfig
 if TYPE_CHECKING:
     from wildgs.viewer.serving import TrainingWindow
 
-CONFIG_FILE = "config.yaml"
-BUDGET = "train.density.max_gaussians"
 SHOWN = (
     "method",
     "preset",

@@ -12,10 +12,10 @@ from wildgs.model.registry import DEFAULT_METHOD
 
 MIXED = "mixed"
 PROTOCOLS = ("full", "half")
-_IN_MEAN = ("psnr", "ssim", "lpips", "landmark", "elsewhere", "detail_energy", "detail_correlation")
+METRICS = ("psnr", "ssim", "lpips", "landmark", "elsewhere", "detail_energy", "detail_correlation")
 _PLAIN = ("train_seconds", "render_fps", "num_gaussians", "static_hidden", "static_hidden_worst")
 _MASKS = {"mask_ap": "average_precision", "mask_iou": "iou"}
-QUANTITIES = (*_IN_MEAN, *_PLAIN, *_MASKS)
+QUANTITIES = (*METRICS, *_PLAIN, *_MASKS)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def _row(
 
 def _value(score: Score, name: str) -> float | None:
     metrics = score.metrics
-    if name in _IN_MEAN:
+    if name in METRICS:
         value = metrics["mean"].get(name)
     elif name in _MASKS:
         value = metrics.get("masks", {}).get(_MASKS[name])

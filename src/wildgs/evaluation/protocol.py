@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError
+from wildgs.evaluation.benchmark import METRICS
 from wildgs.evaluation.lpips import LPIPS, MIN_SIDE, load_lpips
 from wildgs.evaluation.metrics import (
     LEAST_LANDMARK_PIXELS,
@@ -31,7 +32,6 @@ from wildgs.model.method import Method
 from wildgs.scene.scene import Scene, View, observed_pixels
 
 Protocol = Literal["full", "half"]
-METRICS = ("psnr", "ssim", "lpips", "landmark", "elsewhere", "detail_energy", "detail_correlation")
 _TIMED_FRAMES = 15
 
 

@@ -12,13 +12,12 @@ from typing import Any
 
 import yaml
 
-from wildgs.config import RunConfig, differing_entries, read_config, with_entries
+from wildgs.config import CONFIG_FILE, RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.benchmark_table import PHOTOTOURISM
 from wildgs.library.config import BENCH_METHODS, HALF, WITHOUT
 from wildgs.model.registry import METHODS, method_type
 from wildgs.presets import PRESETS, PresetName, with_preset
-from wildgs.runs import CONFIG_FILE
 from wildgs.scene.colmap import find_model
 from wildgs.scene.split import find_split_file
 

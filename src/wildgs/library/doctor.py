@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from wildgs.config import CONFIG_FILE
 from wildgs.files import check_regular
 from wildgs.library.logs import LOG_FILE
-from wildgs.runs import CONFIG_FILE
 
 State = Literal["works", "missing", "broken"]
 

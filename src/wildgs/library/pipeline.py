@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from wildgs.config import ExecutionConfig, RunConfig, read_config, with_entries
+from wildgs.config import CONFIG_FILE, ExecutionConfig, RunConfig, read_config, with_entries
 from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.engine.trainer import Observer
 from wildgs.errors import UserError
@@ -26,7 +26,7 @@ from wildgs.priors.config import StereoConfig
 from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 from wildgs.priors.stereo.depth import fill_metric_folder
 from wildgs.progress import Progress, counter, silent
-from wildgs.runs import CONFIG_FILE, default_device, load_run, lock_run
+from wildgs.runs import default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
 from wildgs.scene.demo import write_demo_scene
 from wildgs.sfm.config import SfmConfig

@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 
 from wildgs import features
-from wildgs.config import ExecutionConfig, RunConfig, differing_entries, read_config
+from wildgs.config import BUDGET, CONFIG_FILE, ExecutionConfig, RunConfig, differing_entries, read_config
 from wildgs.engine.autosave import Autosave, CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
@@ -26,7 +26,6 @@ from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, 
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import (
     CHECKPOINT_FOLDER,
-    CONFIG_FILE,
     default_device,
     lock_run,
     prepare_training,
@@ -43,8 +42,6 @@ LEAST_SECONDS_ON_CUDA = 60.0
 """Smallest time between checkpoints on a GPU, where a thousand steps take about ten seconds."""
 RETRY_SHARE = 0.8
 """Upper bound on Gaussians of the second attempt, relative to their number when memory ran out."""
-BUDGET = "train.density.max_gaussians"
-"""The only entry that may change when a run is resumed, since it depends on the machine's memory."""
 
 Attachment = Callable[[Trainer, Scene], AbstractContextManager[Observer]]
 """Opens an observer of one training, such as a viewer, which is closed when the training ends or fails."""

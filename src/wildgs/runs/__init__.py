@@ -14,7 +14,7 @@ import filelock
 import torch
 from torch import Tensor
 
-from wildgs.config import RunConfig, edited_entries, read_config, to_plain, write_config
+from wildgs.config import CONFIG_FILE, RunConfig, edited_entries, read_config, to_plain, write_config
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
@@ -28,7 +28,6 @@ from wildgs.scene import Alignment, Scene, load_scene
 from wildgs.scene.carried import SCENE_FILE, carry_scene, read_carried_scene
 from wildgs.scene.scene_record import SceneRecord
 
-CONFIG_FILE = "config.yaml"
 LOCK_FILE = ".lock"
 
 
@@ -97,8 +96,8 @@ class Run:
         root = root or self.config.scene
         if not root.is_dir():
             raise UserError(
-                f"{root}: no such folder, but {self.folder} was trained on its photos: `wildgs eval` takes their "
-                "present folder by --scene; a run of an earlier version stores copies when it is resumed "
+                f"{root}: no such folder, but {self.folder} was trained on its photos: give their current "
+                "folder with `wildgs eval --scene`; a run of an earlier version stores copies when it is resumed "
                 f"(`wildgs train SCENE --output {self.folder} --resume`)"
             )
         return root
