@@ -42,7 +42,7 @@ def test_share_is_kept_however_much_is_asked_for(cost: float, step_seconds: floa
             jobs.put(kind, work)
 
     turns = TrainingTurns(jobs, lambda: True, lambda _: jobs.put("light", work), clock=clock)
-    seconds = 1000.0
+    seconds = 300.0
     steps = training(turns, clock, step_seconds, seconds)
     assert steps * step_seconds >= (1 - SHARE) * seconds - cost
     assert turns.seconds >= 0.5 * SHARE * seconds if cost > 0.1 else turns.seconds > 0
