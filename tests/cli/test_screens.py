@@ -20,8 +20,10 @@ SOURCE = Path(__file__).parents[2] / "src"
 TRAIN = ("--method", "3dgs", "--steps", "30", "--checkpoint-every", "1000")
 
 
-def start(landmark: Path, run: Path, *options: object, **streams: object) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "wildgs", "train", landmark, "--output", run, *TRAIN, *options]
+def start(
+    landmark: Path, run: Path, *options: object, python: str | Path = sys.executable, **streams: object
+) -> subprocess.Popen[bytes]:
+    command = [python, "-m", "wildgs", "train", landmark, "--output", run, *TRAIN, *options]
     environment = os.environ | {"PYTHONPATH": str(SOURCE), "WILDGS_NUM_THREADS": "1"}
     return subprocess.Popen([str(part) for part in command], env=environment, **streams)  # pyright: ignore
 
@@ -31,9 +33,9 @@ def trained_steps(run: Path) -> int:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_output_on_a_full_disk(landmark: Path, tmp_path: Path) -> None:
+def test_output_on_a_full_disk(forking_python: Path, landmark: Path, tmp_path: Path) -> None:
     with Path("/dev/full").open("wb") as full:
-        process = start(landmark, tmp_path / "run", stdout=full, stderr=full)
+        process = start(landmark, tmp_path / "run", python=forking_python, stdout=full, stderr=full)
         assert process.wait() == 0
     assert trained_steps(tmp_path / "run") == 30
 

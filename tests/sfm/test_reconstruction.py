@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from wildgs.sfm.workplace import Workplace
 Corner = tuple[list[np.ndarray], list[np.ndarray]]
 # Affine shape finds more matches in photos as small as these.
 AFFINE = SfmConfig(affine_features=True)
+SMALL = SfmConfig(max_image_size=800)
 EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3), affine_features=True)
 
 
@@ -393,7 +395,7 @@ def test_too_few_photos_end_in_one_line(tmp_path: Path, corner: Corner) -> None:
 
 @pytest.mark.shared
 def test_all_of_sacre_coeur_registers(tmp_path: Path, shared: Path) -> None:
-    report = reconstruct(shared / "data/sacre_coeur/images", tmp_path / "scene")
+    report = reconstruct(shared / "data/sacre_coeur/images", tmp_path / "scene", SMALL)
     assert len(report.registered) == 10
     assert report.left_out == {}
     assert report.reprojection_error < 1
@@ -404,7 +406,7 @@ def test_all_of_sacre_coeur_registers(tmp_path: Path, shared: Path) -> None:
 
 @pytest.mark.shared
 def test_sacre_coeur_registers_by_retrieval(tmp_path: Path, shared: Path) -> None:
-    config = SfmConfig(pairing=PairingConfig(exhaustive_limit=5, neighbours=6))
+    config = replace(SMALL, pairing=PairingConfig(exhaustive_limit=5, neighbours=6))
     report = reconstruct(shared / "data/sacre_coeur/images", tmp_path / "scene", config)
     assert report.pairing == "retrieval"
     assert report.pairs < 45
