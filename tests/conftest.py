@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -78,6 +78,16 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
             config.option.numprocesses = min(os.cpu_count() or 1, 4)
         if config.option.dist == "no":
             config.option.dist = "loadfile"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Escapes what was captured of file names that are not UTF-8, which pytest-xdist cannot send."""
+    report = yield
+    report.sections = [
+        (title, text.encode(errors="backslashreplace").decode()) for title, text in report.sections
+    ]
+    return report
 
 
 def _missing(marker: str) -> str | None:
