@@ -72,7 +72,10 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     Parts of the suite run in this process: each worker has to import everything and to make its own fixtures. `-n`
     overrides this.
     """
-    whole = config.args_source != pytest.Config.ArgsSource.ARGS
+    whole = (
+        config.args_source != config.ArgsSource.ARGS
+        or Path(config.args[0]).resolve() == Path(__file__).parent
+    )
     if whole and config.pluginmanager.hasplugin("xdist") and not config.option.usepdb:
         if config.option.numprocesses is None:
             config.option.numprocesses = min(os.cpu_count() or 1, 4)
