@@ -175,7 +175,7 @@ def test_screen_gradient_is_per_half_picture(method: VanillaGS) -> None:
     projection.means2d.retain_grad()
     (projection.means2d * torch.tensor([3.0, 4.0])).sum().backward()
     blank = torch.zeros(32, 64, 3)
-    control.gather(SeenView(projection, blank, blank))
+    control.gather(SeenView(projection, blank, torch.zeros(4, 3), blank))
     expected = torch.where(projection.visible, torch.tensor([3.0 * 32, 4.0 * 16]).norm(), 0.0)
     torch.testing.assert_close(control.demand, expected)
     assert torch.equal(control.seen, projection.visible.float())

@@ -38,10 +38,11 @@ def camera() -> Camera:
 def view_of(method: VanillaGS, wrong: tuple[slice, slice], error: float = 0.5) -> SeenView:
     """A photo that is what the method renders, but in one part."""
     projection = method.gaussians.project(camera())
-    colors = blend(projection, torch.full((len(method.gaussians), 3), 0.2)).colors.detach()
-    photo = colors.clone()
+    painted = torch.full((len(method.gaussians), 3), 0.2, requires_grad=True)
+    colors = blend(projection, painted).colors
+    photo = colors.detach().clone()
     photo[wrong] += error
-    return SeenView(projection, colors, photo)
+    return SeenView(projection, colors, painted, photo)
 
 
 UPPER_LEFT, LOWER_RIGHT = (slice(0, 16), slice(0, 16)), (slice(16, 32), slice(16, 32))

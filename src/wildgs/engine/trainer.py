@@ -189,10 +189,14 @@ class Trainer:
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
             seen = SeenView(
-                output.projection, output.rendering.colors, photo, self._static_pixels(output, keep)
+                output.projection,
+                output.rendering.colors,
+                output.painted,
+                photo,
+                self._static_pixels(output, keep),
             )
         skipped = self._report_marked()
-        losses.total.backward()
+        losses.total.backward(retain_graph=seen is not None and self.density.reuses_blend)
         losses = self.team.average(self.method.parameters(), losses)
         skipped = self._take(seen, losses) or skipped
         before = self.step

@@ -112,16 +112,19 @@ def structural_correlation(
 
 def _box_mean(x: Float[Tensor, "B 1 H W"], radius: int) -> Float[Tensor, "B 1 H W"]:
     """Means over squares of ``2 radius + 1`` pixels around every pixel, cropped at the borders."""
-    return _line_mean(_line_mean(x, radius).mT, radius).mT
+    return _column_mean(_column_mean(x, radius).mT.contiguous(), radius).mT
 
 
-def _line_mean(x: Float[Tensor, "*batch W"], radius: int) -> Float[Tensor, "*batch W"]:
-    """Means over ``2 radius + 1`` entries of a row around every entry, by cumulative sums."""
-    width = x.shape[-1]
-    sums = functional.pad(x.cumsum(dim=-1), (1, 0))
-    place = torch.arange(width, device=x.device)
-    low, high = (place - radius).clamp_min(0), (place + radius + 1).clamp_max(width)
-    return (sums[..., high] - sums[..., low]) / (high - low)
+def _column_mean(x: Float[Tensor, "*batch H W"], radius: int) -> Float[Tensor, "*batch H W"]:
+    """Means over ``2 radius + 1`` entries of a column around every entry, by cumulative sums.
+
+    Sums down the columns are vectorised over the rows' contiguous entries on the CPU; sums along rows are not.
+    """
+    height = x.shape[-2]
+    sums = functional.pad(x.cumsum(dim=-2), (0, 0, 1, 0))
+    place = torch.arange(height, device=x.device)
+    low, high = (place - radius).clamp_min(0), (place + radius + 1).clamp_max(height)
+    return (sums.index_select(-2, high) - sums.index_select(-2, low)) / (high - low)[:, None]
 
 
 @torch.no_grad()

@@ -254,7 +254,7 @@ class AffineGS(Method):
         projection.means2d.retain_grad()
         appearance = Appearance(self._mean() if learnt is None else learnt)
         colors = self.paint(projection, appearance, stage.sh_degree)
-        return TrainingOutput(blend(projection, colors), projection, None)
+        return TrainingOutput(blend(projection, colors), projection, None, colors)
 
 
 def _key(name: str) -> int:

@@ -268,7 +268,7 @@ class Method(nn.Module, ABC):
         projection = self.gaussians.project(camera, absgrad=stage.absgrad)
         projection.means2d.retain_grad()
         colors = self.paint(projection, self.encode(photo, camera, keep, name=name), stage.sh_degree)
-        return TrainingOutput(blend(projection, colors), projection, None)
+        return TrainingOutput(blend(projection, colors), projection, None, colors)
 
     def render(
         self,

@@ -168,12 +168,12 @@ class PhotoMatch(nn.Module):
         colors: Float[Tensor, "V 3"],
         change: Float[Tensor, "3 M"],
         means: Float[Tensor, "V 3"],
-        intrinsic: Float[Tensor, "V I"],
+        codes: Float[Tensor, "V L"],
         centre: Float[Tensor, " 3"],
     ) -> Float[Tensor, "V 3"]:
         """Applies a transform fitted in training, with a gain per channel, to colours of Gaussians.
 
-        Colours, intrinsic features and light codes get gradients. `harmonics` is the counterpart for harmonics.
+        Colours and light codes get gradients. `harmonics` is the counterpart for harmonics.
         """
         own, by_code, of_sky, by_elevation = split_change(change, self.num_codes)
         gains, offsets = 1 + own[:, :3].diagonal(), own[:, 3].expand(len(colors), 3)
@@ -186,7 +186,7 @@ class PhotoMatch(nn.Module):
             elevated = torch.addmm(of_sky[:, 3], elevation_powers(sky.sine), by_elevation.T)
             offsets = torch.where(which, elevated, offsets)
         if self.codes is not None:
-            offsets = offsets + below * (intrinsic @ (by_code @ self.codes.weight).T)
+            offsets = offsets + below * (codes @ by_code.T)
         return torch.addcmul(offsets, colors, gains)
 
     def harmonics(

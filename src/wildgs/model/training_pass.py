@@ -45,11 +45,13 @@ class TrainingOutput:
         rendering: Colours, expected depth and alpha.
         projection: Projection of the Gaussians, whose statistics densification uses.
         visibility: M; None for a method without a mask.
+        painted: Colours of the Gaussians that were blended.
     """
 
     rendering: Rendering
     projection: Projection
     visibility: Float[Tensor, "H W"] | None
+    painted: Float[Tensor, "N 3"]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from wildgs.model.photo_match import PhotoMatch, Sight
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
-from wildgs.rasterize import Projection, blend
+from wildgs.rasterize import Projection, blend, sh_to_colors
 
 
 class WildGS(Method):
@@ -199,18 +199,21 @@ class WildGS(Method):
         return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
 
     def _matched(
-        self, colors: Float[Tensor, "V 3"], rows: Int[Tensor, " V"], sight: Sight
+        self,
+        colors: Float[Tensor, "V 3"],
+        means: Float[Tensor, "V 3"],
+        intrinsic: Float[Tensor, "V I"],
+        rows: Int[Tensor, " V"],
+        sight: Sight,
     ) -> Float[Tensor, "V 3"]:
-        """Applies the colour match, scaled by `matched_loss`, to colours in training."""
+        """Applies the colour match, scaled by `matched_loss`, to colours of the given Gaussians in training."""
         match, centre = self.photo_match, self._centre
-        intrinsic = take_rows(self.gaussians.rows["intrinsic"], rows)
+        codes = match.light_codes(intrinsic)
         with torch.no_grad():
-            values = torch.cat([colors, match.light_codes(intrinsic)], dim=1)
-            values = spread_rows(values, rows, self.num_gaussians)
+            values = spread_rows(torch.cat([colors, codes], dim=1), rows, self.num_gaussians)
             picture = match.picture(sight.projection, values, centre, training=True)
             change = self.config.matched_loss * match.find(sight, picture, training=True)
-            means = self.gaussians.means[rows]
-        return match.changed(colors, change, means, intrinsic, centre)
+        return match.changed(colors, change, means, codes, centre)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -276,22 +279,28 @@ class WildGS(Method):
     def embed(self, appearance: Appearance, rows: Int[Tensor, " V"] | None = None) -> Embeddings:
         """Samples local embeddings at the Gaussians."""
         means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
+        return self._embedded(appearance, means)
+
+    def _embedded(self, appearance: Appearance, means: Float[Tensor, "V 3"]) -> Embeddings:
+        """Embeddings of Gaussians with the given centres."""
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
         return Embeddings(appearance.global_embedding, local, appearance.color_map, appearance.basis_weights)
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) of the given Gaussians, plus the light basis."""
-        harmonics = self._fused(embeddings, rows)
+        means, intrinsic = self.gaussians.means, self.gaussians.rows["intrinsic"]
+        if rows is not None:
+            means, intrinsic = take_rows(means, rows), take_rows(intrinsic, rows)
+        harmonics = self._fused(embeddings, means, intrinsic)
         if embeddings.basis_weights is None:
             return harmonics
         return harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
 
-    def _fused(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None) -> Float[Tensor, "N K 3"]:
+    def _fused(
+        self, embeddings: Embeddings, means: Float[Tensor, "V 3"], intrinsic: Float[Tensor, "V I"]
+    ) -> Float[Tensor, "V K 3"]:
         """Spherical harmonics by the fusion network and the colour match."""
-        intrinsic = self.gaussians.rows["intrinsic"]
-        if rows is not None:
-            intrinsic = take_rows(intrinsic, rows)
         if self._lacks("intrinsic"):
             intrinsic = torch.zeros_like(intrinsic)
         common, local, change = (
@@ -301,7 +310,6 @@ class WildGS(Method):
         )
         if change is None or change.shape[1] == 4:
             return self.fusion(common, local, intrinsic, change)
-        means = self.gaussians.means if rows is None else take_rows(self.gaussians.means, rows)
         harmonics = self.fusion(common, local, intrinsic)
         return self.photo_match.harmonics(harmonics, change, means, intrinsic, self._centre)
 
@@ -327,10 +335,13 @@ class WildGS(Method):
             lifted = self._lifted_in_training(photo, keep)
             appearance = self.wrap(photo, appearance, projection, lifted, learn=stage.learn_planes)
         rows = rows_to_shade(projection.visible)
+        # Taken once: every further gather of a row has a scatter in the backward pass.
+        means, intrinsic = (take_rows(self.gaussians.rows[name], rows) for name in ("means", "intrinsic"))
+        harmonics = self._fused(self._embedded(appearance, means), means, intrinsic)
         matched = bool(self.config.color_match and self.config.matched_loss)
-        colors = self.paint_rows(rows, camera, appearance, stage.sh_degree, clamped=not matched)
+        colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
         if matched:
             sight = Sight(photo, projection, appearance.visibility, keep)
-            colors = self._matched(colors, rows, sight).clamp_min(0)
+            colors = self._matched(colors, means, intrinsic, rows, sight).clamp_min(0)
         colors = spread_rows(colors, rows, self.num_gaussians)
-        return TrainingOutput(blend(projection, colors), projection, appearance.visibility)
+        return TrainingOutput(blend(projection, colors), projection, appearance.visibility, colors)

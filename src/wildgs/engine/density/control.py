@@ -47,12 +47,14 @@ class SeenView:
     Attributes:
         projection: Projection of the Gaussians, after the backward pass.
         colors: The render.
+        painted: Colours of the Gaussians, of which `colors` is blended.
         photo: RGB in [0, 1].
         counts: Mask of the photo's pixels that are neither transient nor masked by the user; None for all.
     """
 
     projection: Projection
     colors: Float[Tensor, "H W 3"]
+    painted: Float[Tensor, "N 3"]
     photo: Float[Tensor, "H W 3"]
     counts: Bool[Tensor, "H W"] | None = None
 
@@ -72,6 +74,8 @@ class DensityControl(ABC):
     """Share of the training steps after which densification ends."""
     absgrad: bool = False
     """Whether the strategy needs `Projection.absgrad`."""
+    reuses_blend: bool = False
+    """Whether `measure` runs the backward pass of the step's blend once more, for which its graph is kept."""
 
     def __init__(
         self, config: DensityConfig, extent: float, num_gaussians: int, device: torch.device | str = "cpu"

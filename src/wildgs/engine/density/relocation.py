@@ -10,8 +10,6 @@ et al. 2024).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -20,10 +18,9 @@ from wildgs.engine.density.control import DensityControl, DensityReport, SeenVie
 from wildgs.engine.optimizers import edit_rows
 from wildgs.geometry.camera import quats_to_rotations
 from wildgs.model.gaussians import Gaussians
-from wildgs.rasterize import Projection, blend
 
 MEASURE_EVERY = 7
-"""Interval of measured steps; a measurement costs an additional blend of two channels."""
+"""Interval of measured steps; a measurement costs a further backward pass of the blend."""
 LEAST_VIEWS = 2
 """Minimum number of measured views before a Gaussian without contribution is pruned."""
 MEMORY = 0.8
@@ -38,6 +35,7 @@ class RelocationDensity(DensityControl):
 
     resets = False
     until = 0.8
+    reuses_blend = True
 
     def _clear(self, num_gaussians: int) -> None:
         super()._clear(num_gaussians)
@@ -56,12 +54,10 @@ class RelocationDensity(DensityControl):
 
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
         """Blending-weighted sums over pixels for each Gaussian: image error, and 1."""
-        values = view.projection.means2d.new_ones(len(view.projection.means2d), 2, requires_grad=True)
-        with torch.enable_grad():
-            shown = blend(_detached(view.projection), values, depth=False).colors
         error = view.error
-        weights = torch.stack([error, torch.ones_like(error)], dim=-1)
-        covered, pixels = torch.autograd.grad(shown, values, weights)[0].unbind(1)
+        # A pixel's gradient to a Gaussian's colour is the Gaussian's blending weight, whatever the colours are.
+        weights = torch.stack([error, torch.ones_like(error), torch.zeros_like(error)], dim=-1)
+        covered, pixels, _ = torch.autograd.grad(view.colors, view.painted, weights)[0].unbind(1)
         visible = view.projection.visible if sound is None else view.projection.visible & sound
         return ViewStatistics(
             demand=torch.where(visible, covered, 0.0),
@@ -138,9 +134,3 @@ class RelocationDensity(DensityControl):
         )
         self._clear(len(source))
         self.known, self.largest = known, largest
-
-
-def _detached(projection: Projection) -> Projection:
-    """The projection, detached from the autograd graph."""
-    names = ("means2d", "depths", "conics", "opacities")
-    return replace(projection, **{name: getattr(projection, name).detach() for name in names}, absgrad=None)
