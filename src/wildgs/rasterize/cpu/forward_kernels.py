@@ -13,7 +13,15 @@ from __future__ import annotations
 import numpy as np
 
 from wildgs.kernel_cache import njit
-from wildgs.rasterize.cpu.picture_kernels import CLOSED, PATCH, aligned, ask_for_tile, close_tile, open_tile
+from wildgs.rasterize.cpu.picture_kernels import (
+    CLOSED,
+    COLORS,
+    PATCH,
+    aligned,
+    ask_for_tile,
+    close_tile,
+    open_tile,
+)
 from wildgs.rasterize.cpu.reach_kernels import HALF, MIN_LEVEL, RECORD, TILE, reach
 from wildgs.rasterize.cpu.simd import (
     LANES,
@@ -87,19 +95,16 @@ def blend_forward(
 
     `masks` takes for each pair a bit per block that the Gaussian reaches; it is LANES longer than there are pairs.
 
-    `final_transmittance` and `last` (the last blended position in the tile's list, from 1) are laid out by tile
-    and block for the backward pass; they are None where there will be none.
+    `final_transmittance` and `last` (the last position in the tile's list, from 1, before the pixel was saturated)
+    are laid out by tile and block for the backward pass; they are None where there will be none.
     """
     tiles_x = (width + TILE - 1) // TILE
-    stride = (channels + 4) * LANES
+    stride = (channels + COLORS) * LANES
     sums = aligned(16 * stride)
     reached = aligned(PIXELS)
     patch = aligned(PATCH)
     batch = aligned(FIELDS * BATCH)
     words = np.empty(16, np.int64)
-    positions = aligned(BATCH)
-    for i in range(BATCH):
-        positions[i] = i + 1
     while True:
         item = fetch_add(counter, 1)
         if item >= tile_order.size:
@@ -111,8 +116,10 @@ def blend_forward(
         if with_depth:
             ask_for_tile(tx, ty, width, height, 1, out_depth, True)
         alive = open_tile(tx, ty, width, height, stride, sums)
-        reached[:] = 0.0
         begin, end = offsets[tile], offsets[tile + 1]
+        for block in range(16):
+            inside = vload(sums, block * stride + LANES) < CLOSED
+            vstore(reached, block * LANES, select(inside, np.float32(end - begin), 0.0))
         for start in range(begin, end, BATCH):
             if alive == 0:
                 break
@@ -127,11 +134,10 @@ def blend_forward(
                 py = lane_y() + np.float32((block >> 2) * 4)
                 before, px = vload(sums, at), vload(sums, at + LANES)
                 total, depth = vload(sums, at + 2 * LANES), vload(sums, at + 3 * LANES)
-                hits = splat(0.0)
                 red, green, blue = splat(0.0), splat(0.0), splat(0.0)
                 if channels == 3:
-                    red, green = vload(sums, at + 4 * LANES), vload(sums, at + 5 * LANES)
-                    blue = vload(sums, at + 6 * LANES)
+                    red, green = vload(sums, at + COLORS * LANES), vload(sums, at + (COLORS + 1) * LANES)
+                    blue = vload(sums, at + (COLORS + 2) * LANES)
                 while word != 0:
                     i = lowest_bit(word)
                     word &= word - 1
@@ -141,14 +147,16 @@ def blend_forward(
                     exponent = fma(-u, u, fma(-v, v, vspread(batch, g + LEVEL)))
                     alpha = vmin(vexp2(exponent), MAX_ALPHA)
                     hit = exponent >= MIN_LEVEL
-                    after = select(hit, fma(-before, alpha, before), before)
+                    weight = select(hit, before * alpha, 0.0)
+                    after = before - weight
                     full = after <= MIN_TRANSMITTANCE
                     if mask_bits(full) != 0:
-                        px, after, hit = select(full, CLOSED, px), select(full, before, after), hit & ~full
-                    weight = select(hit, before * alpha, 0.0)
+                        px, after = select(full, CLOSED, px), select(full, before, after)
+                        weight = select(full, 0.0, weight)
+                        if last is not None:
+                            visited = splat(np.float32(start - begin + i))
+                            vstore(reached, block * LANES, select(full, visited, vload(reached, block * LANES)))
                     before, total = after, total + weight
-                    if last is not None:
-                        hits = select(hit, vspread(positions, i), hits)
                     if with_depth:
                         depth = fma(weight, vspread(batch, g + DEPTH), depth)
                     if channels == 3:
@@ -158,19 +166,16 @@ def blend_forward(
                     else:
                         first = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
-                            to = at + (k + 4) * LANES
+                            to = at + (k + COLORS) * LANES
                             vstore(sums, to, fma(weight, values[first + k], vload(sums, to)))
                 vstore(sums, at, before)
                 vstore(sums, at + LANES, px)
                 vstore(sums, at + 2 * LANES, total)
                 vstore(sums, at + 3 * LANES, depth)
-                if last is not None:
-                    hits = select(hits > 0.0, hits + np.float32(start - begin), vload(reached, block * LANES))
-                    vstore(reached, block * LANES, hits)
                 if channels == 3:
-                    vstore(sums, at + 4 * LANES, red)
-                    vstore(sums, at + 5 * LANES, green)
-                    vstore(sums, at + 6 * LANES, blue)
+                    vstore(sums, at + COLORS * LANES, red)
+                    vstore(sums, at + (COLORS + 1) * LANES, green)
+                    vstore(sums, at + (COLORS + 2) * LANES, blue)
                 if mask_bits(px < CLOSED) == 0:
                     alive &= ~(1 << block)
         close_tile(

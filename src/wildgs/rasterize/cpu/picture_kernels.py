@@ -11,6 +11,7 @@ from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload,
 
 LANES = 16
 PATCH = 48  # floats that a block of three channels has
+COLORS = 4  # the first channel's place among a block's vectors, after transmittance, column, alpha and depth
 CLOSED = np.float32(1e15)  # column of a pixel that takes nothing more; its square is finite
 
 
@@ -72,9 +73,10 @@ def open_tile(tx, ty, width, height, stride, sums):
     for block in range(16):
         x, y = tx * TILE + (block & 3) * 4, ty * TILE + (block >> 2) * 4
         vstore(sums, block * stride, splat(1.0))
-        vstore(sums, block * stride + LANES, lane_x() + np.float32((block & 3) * 4))
+        vstore(sums, block * stride + LANES, splat(CLOSED))
         if x < width and y < height:
             alive |= 1 << block
+            vstore(sums, block * stride + LANES, lane_x() + np.float32((block & 3) * 4))
             if x + 4 > width or y + 4 > height:
                 for lane in range(LANES):
                     if x + (lane & 3) >= width or y + (lane >> 2) >= height:
@@ -101,9 +103,9 @@ def close_tile(
             vstore(patch, 0, select(seen, vload(sums, at + 3 * LANES) / select(seen, alpha, 1.0), 0.0))
             put_rows(patch, 1, out_depth, x, y, width, height)
         if channels == 3:
-            red = vload(sums, at + 4 * LANES) + transmittance * background[0]
-            green = vload(sums, at + 5 * LANES) + transmittance * background[1]
-            blue = vload(sums, at + 6 * LANES) + transmittance * background[2]
+            red = vload(sums, at + COLORS * LANES) + transmittance * background[0]
+            green = vload(sums, at + (COLORS + 1) * LANES) + transmittance * background[1]
+            blue = vload(sums, at + (COLORS + 2) * LANES) + transmittance * background[2]
             vstore3(patch, 0, (red, green, blue))
             put_rows(patch, 3, out_colors, x, y, width, height)
         else:
@@ -112,7 +114,7 @@ def close_tile(
                     pixel = (y + (lane >> 2)) * width + x + (lane & 3)
                     through = sums[at + lane]
                     for k in range(channels):
-                        value = sums[at + (k + 4) * LANES + lane] + through * background[k]
+                        value = sums[at + (k + COLORS) * LANES + lane] + through * background[k]
                         out_colors[pixel * channels + k] = value
 
 
