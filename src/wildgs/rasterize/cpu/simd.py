@@ -263,13 +263,14 @@ def vratio(typingctx, a, b):
     return (VECTOR(a, b), codegen) if a is VECTOR and b is VECTOR else None
 
 
-# exp2 on [-0.5, 0.5], minimax of degree 4, relative error 2.6e-6... 
-_EXP2 = (0.00957010199, 0.0559178606, 0.240247448, 0.693121815, 0.999999261)
+# exp2 on [-0.5, 0.5], minimax of degree 4, relative error 2.6e-6, a thousandth of what 8 bits resolve. A further
+# degree makes blending 3% slower.
+_EXP2 = (9.57010199e-3, 5.59178606e-2, 0.240247448, 0.693121815, 0.999999261)
 
 
 @intrinsic
 def vexp2(typingctx, value):
-    """2 to the power of each lane, for lanes in [-125, 0]; relative error about 2.6e-06."""
+    """2 to the power of each lane, for lanes in [-125, 0]; relative error about 3e-6."""
 
     def codegen(context, builder, sig, args):
         x = args[0]
