@@ -19,6 +19,7 @@ from wildgs.library.collection import (
 from wildgs.library.evaluation import Scores, evaluate
 from wildgs.library.logs import logger
 from wildgs.library.pages import write_scene_page, write_showcase
+from wildgs.library.side_training import training_beside
 from wildgs.library.training import read_scene, train
 from wildgs.model.config import ParsingConfig, WildGSConfig
 from wildgs.model.registry import MethodName, method_type
@@ -26,7 +27,7 @@ from wildgs.priors.config import StereoConfig
 from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 from wildgs.priors.stereo.depth import fill_metric_folder
 from wildgs.progress import Progress, counter, silent
-from wildgs.runs import default_device, load_run, lock_run
+from wildgs.runs import Run, default_device, load_run, lock_run
 from wildgs.scene.config import DataConfig
 from wildgs.scene.demo import write_demo_scene
 from wildgs.sfm.config import SfmConfig
@@ -273,7 +274,8 @@ def demo(
         steps: Training steps of each method.
         execution: How training is executed.
         progress: Called during all stages.
-        observers: Called with a `StepReport` after every training step.
+        observers: Called with a `StepReport` after every training step in this process. On a CPU with several
+            threads, 3DGS is trained in another process at the same time.
 
     Raises:
         UserError: The pages already exist, or the folder cannot be written to.
@@ -284,27 +286,45 @@ def demo(
         raise UserError(f"steps {steps}: must be 1 or more")
     if report.exists():
         raise UserError(f"{report} already exists; open it, or choose another --output")
+    execution = execution or ExecutionConfig()
     with lock_run(output):
         folder = write_demo_scene(output / "scene")
+        first, second = (_configuration(folder, method, steps) for method in COMPARED)
         runs = []
-        for method in COMPARED:
-            config = _configuration(folder, method, steps)
-            scene = read_scene(config, execution or ExecutionConfig(), progress)
-            target = output / method
-            train(
-                scene,
-                config,
-                output=target,
-                execution=execution,
-                resume="auto",
-                progress=progress,
-                observers=observers,
-            )
-            loaded = load_run(target)
-            runs.append((method_type(method).label, loaded, evaluate(loaded, scene=scene, progress=progress)))
+        with training_beside(second, output / second.method, execution) as (give_threads, beside):
+            own = replace(execution, threads=None) if beside else execution
+            runs.append(_train_and_score(first, output, own, progress, [*observers, give_threads]))
+            if beside is not None and beside.poll() is None:
+                logger.info(f"waiting for the training of {second.method}")
+                beside.wait()
+        runs.append(_train_and_score(second, output, execution, progress, observers))
+        scene = read_scene(first, execution)
         write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
         write_scene_page(runs[0][1], page, TITLE, progress)
     return FinishedRun(output, {name: scores for name, _, scores in runs}, report, page)
+
+
+def _train_and_score(
+    config: RunConfig,
+    output: Path,
+    execution: ExecutionConfig,
+    progress: Progress | None,
+    observers: Sequence[Observer],
+) -> tuple[str, Run, Scores]:
+    """Trains, or continues, a run of the demo; returns its label, the run and its scores."""
+    scene = read_scene(config, execution, progress)
+    folder = output / config.method
+    train(
+        scene,
+        config,
+        output=folder,
+        execution=execution,
+        resume="auto",
+        progress=progress,
+        observers=observers,
+    )
+    loaded = load_run(folder)
+    return method_type(config.method).label, loaded, evaluate(loaded, scene=scene, progress=progress)
 
 
 def _configuration(folder: Path, method: MethodName, steps: int) -> RunConfig:

@@ -40,7 +40,8 @@ from wildgs.threads import fetch_add
 Q, QU, QV, QUU, QUV, QVV, Q_DEPTH, Q_RED, Q_GREEN, Q_BLUE, ABS_X, ABS_Y = SUM_LANES
 ROW_COLORS = 16
 # A block's numbers lie together: transmittance behind what was visited so far, then at these offsets the sum of w g
-# behind, the last position before the pixel was saturated, and the gradients of accumulated alpha, depth sum and colours.
+# behind, the last position before the pixel was saturated, and the gradients of accumulated alpha, depth sum and
+# colours.
 BEHIND, REACHED, V_ALPHA, V_DEPTH, V_COLORS = 16, 32, 48, 64, 80
 
 

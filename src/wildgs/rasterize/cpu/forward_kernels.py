@@ -155,7 +155,9 @@ def blend_forward(
                         weight = select(full, 0.0, weight)
                         if last is not None:
                             visited = splat(np.float32(start - begin + i))
-                            vstore(reached, block * LANES, select(full, visited, vload(reached, block * LANES)))
+                            vstore(
+                                reached, block * LANES, select(full, visited, vload(reached, block * LANES))
+                            )
                     before, total = after, total + weight
                     if with_depth:
                         depth = fma(weight, vspread(batch, g + DEPTH), depth)
