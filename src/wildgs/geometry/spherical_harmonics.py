@@ -72,11 +72,11 @@ def sh_basis(degree: int, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor
     return torch.stack(values, dim=-1)
 
 
-def sh_values(sh: Float[Tensor, "N K 3"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+def sh_values(sh: Float[Tensor, "N K C"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
     """Evaluates harmonics in one direction each, without the offset and clamp of `wildgs.rasterize.sh_to_colors`.
 
     Args:
-        sh: Coefficients; their number determines the degree.
+        sh: Coefficients of any number of channels; the number per channel determines the degree.
         directions: Directions from the camera's centre to the Gaussians; they need not be normalised.
     """
     bases = sh_basis(sh_degree(sh), functional.normalize(directions, dim=-1))
@@ -88,7 +88,7 @@ def rgb_to_sh0(rgb: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     return (rgb - 0.5) / C0
 
 
-def sh_degree(sh: Float[Tensor, "N K 3"]) -> int:
+def sh_degree(sh: Float[Tensor, "N K C"]) -> int:
     """Degree of spherical harmonics coefficients.
 
     Raises:

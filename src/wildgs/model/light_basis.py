@@ -35,6 +35,8 @@ ROUNDS = 4
 LEAST_PIXELS = 64
 """Smallest number of pixels for a fit."""
 ROWS_AT_ONCE = 65_536
+BLENDED_AT_ONCE = 8
+"""Components per blend, whose blending weights are computed once for all channels."""
 
 
 class LightBasis(nn.Module):
@@ -122,15 +124,16 @@ class LightBasis(nn.Module):
         return replace(appearance, basis_weights=fit_weights(images, residual, counts))
 
     def _images(self, projection: Projection, means: Float[Tensor, "N 3"]) -> Float[Tensor, "B H W 3"]:
-        """Renders the components."""
+        """Renders the components, `BLENDED_AT_ONCE` at a time."""
         assert self.components is not None
         rows = projection.visible.nonzero()[:, 0]
         towards = means[rows] - projection.camera.position
         pictures = []
-        for component in self.components:
-            seen = sh_values(component[rows].float(), towards)
-            colors = torch.zeros_like(means).index_copy(0, rows, seen)
-            pictures.append(blend(projection, colors, depth=False).colors)
+        for part in self.components.split(BLENDED_AT_ONCE):
+            seen = sh_values(part[:, rows].permute(1, 2, 0, 3).flatten(2).float(), towards)
+            colors = means.new_zeros(len(means), seen.shape[1]).index_copy(0, rows, seen)
+            blended = blend(projection, colors, depth=False).colors
+            pictures += blended.split(3, dim=2)
         return torch.stack(pictures)
 
 
