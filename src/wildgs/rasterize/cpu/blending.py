@@ -108,9 +108,8 @@ def _blend_pictures(
     out_colors = allocate(height, width, channels)
     out_depth = allocate(height, width) if with_depth else torch.zeros(())
     out_alpha = allocate(height, width)
-    size = (tiles.offsets.size - 1) * TILE * TILE
-    transmittance = np.empty(size, np.float32) if bookkeeping else None
-    last = np.empty(size, np.float32) if bookkeeping else None
+    size = (tiles.offsets.size - 1) * TILE * TILE if bookkeeping else 0
+    transmittance, last = np.empty(size, np.float32), np.empty(size, np.float32)
     masks = np.empty(tiles.pairs + LANES, np.int32)
     launch(
         forward_kernels.blend_forward,

@@ -96,7 +96,8 @@ def blend_forward(
     `masks` takes for each pair a bit per block that the Gaussian reaches; it is LANES longer than there are pairs.
 
     `final_transmittance` and `last` (the last position in the tile's list, from 1, before the pixel was saturated)
-    are laid out by tile and block for the backward pass; they are None where there will be none.
+    are laid out by tile and block for the backward pass; they are empty where there will be none (not None, for
+    which the kernel would be compiled a second time).
     """
     tiles_x = (width + TILE - 1) // TILE
     stride = (channels + COLORS) * LANES
@@ -153,7 +154,7 @@ def blend_forward(
                     if mask_bits(full) != 0:
                         px, after = select(full, CLOSED, px), select(full, before, after)
                         weight = select(full, 0.0, weight)
-                        if last is not None:
+                        if last.size > 0:
                             visited = splat(np.float32(start - begin + i))
                             vstore(
                                 reached, block * LANES, select(full, visited, vload(reached, block * LANES))
@@ -184,7 +185,7 @@ def blend_forward(
             tx, ty, width, height, channels, with_depth, background, stride, sums, patch,
             out_colors, out_depth, out_alpha,
         )  # fmt: skip
-        if last is not None:
+        if last.size > 0:
             for block in range(16):
                 to = tile * PIXELS + block * LANES
                 vstore(final_transmittance, to, vload(sums, block * stride))
