@@ -44,7 +44,7 @@ def training_beside(
     """
     total = execution.threads or thread_count()
     if default_device().type != "cpu" or total < 2:
-        yield (lambda report: None), None
+        yield (lambda _: None), None
         return
     share = max(1, total // 4)
     with contextlib.ExitStack() as limits, tempfile.TemporaryDirectory(prefix="wildgs-") as place:
@@ -57,7 +57,7 @@ def training_beside(
         )
         limits.enter_context(limited(total - share))
 
-        def widen(report: StepReport) -> None:
+        def widen(_: object) -> None:
             if process.poll() is not None:
                 limits.close()
 
