@@ -26,6 +26,7 @@ from statistics import median
 import torch
 
 from train_step import make_scene, make_trainer, peak_memory
+from wildgs.engine.density.control import SeenView
 from wildgs.engine.distributed import join
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
@@ -71,9 +72,13 @@ def time_steps(trainer: Trainer, count: int) -> float:
 
 def time_exchange(trainer: Trainer, count: int) -> tuple[float, float]:
     """Median milliseconds of the exchange once all processes are there, and its megabytes."""
-    output, losses = trainer._forward(trainer.feed.next_view())
+    view = trainer.feed.next_view()
+    photo, keep = trainer.feed.photo(view)
+    output, losses = trainer._forward(view, photo, keep)
+    seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, keep)
+    seen = trainer.density.before_backward(seen)
     losses.total.backward()
-    statistics = trainer.density.measure(output.projection)
+    statistics = trainer.density.measure(seen)
     gradients = [p.grad for p in trainer.method.parameters() if p.grad is not None]
     size = sum(4 * gradient.numel() for gradient in gradients) + 3 * 4 * len(statistics.seen)
     times = []

@@ -46,6 +46,7 @@ class _Kernel(torch.autograd.Function):
                 wanted,
                 [gradient for _, gradient in pairs],
                 allow_unused=True,
+                retain_graph=True,  # density control asks for another gradient of the same blend
             )
         by_leaf = {id(leaf): gradient for leaf, gradient in zip(wanted, found, strict=True)}
         given = (by_leaf.get(id(leaf)) for leaf in ctx.leaves)

@@ -42,7 +42,7 @@ def view_of(method: VanillaGS, wrong: tuple[slice, slice], error: float = 0.5) -
     colors = blend(projection, painted).colors
     photo = colors.detach().clone()
     photo[wrong] += error
-    return SeenView(projection, colors, painted, photo)
+    return RelocationDensity(CONFIG, 1.0, 5).before_backward(SeenView(projection, colors, painted, photo))
 
 
 UPPER_LEFT, LOWER_RIGHT = (slice(0, 16), slice(0, 16)), (slice(16, 32), slice(16, 32))
@@ -77,7 +77,7 @@ def test_pixels_that_do_not_count_are_no_error(method: VanillaGS) -> None:
     counts = torch.ones(SIDE, SIDE, dtype=torch.bool)
     counts[UPPER_LEFT] = False
     control = RelocationDensity(CONFIG, 1.0, 5)
-    assert not control.measure(replace(view, counts=counts)).demand.any()
+    assert not control.measure(control.before_backward(replace(view, counts=counts))).demand.any()
 
 
 def test_the_wrong_one_splits_along_its_longest_axis(method: VanillaGS) -> None:

@@ -61,7 +61,8 @@ def step_forward(trainer: Trainer, view: View) -> tuple[SeenView, Losses]:
     """A step up to its losses."""
     photo, keep = trainer.feed.photo(view)
     output, losses = trainer._forward(view, photo, keep)
-    return SeenView(output.projection, output.rendering.colors, output.painted, photo), losses
+    seen = SeenView(output.projection, output.rendering.colors, output.painted, photo)
+    return trainer.density.before_backward(seen), losses
 
 
 def first_gradients(output: Path, team: Team) -> None:
@@ -70,7 +71,7 @@ def first_gradients(output: Path, team: Team) -> None:
         together = trainer_for(method, team, EVERY_STEP)
         together.begin()
         seen, losses = step_forward(together, together.feed.next_view())
-        losses.total.backward(retain_graph=True)
+        losses.total.backward()
         mean = team.average(together.method.parameters(), losses)
         together.density.gather(seen, team.pool)
 
@@ -79,7 +80,7 @@ def first_gradients(output: Path, team: Team) -> None:
         both = []
         for index in alone.sampler.take(2):
             seen, losses = step_forward(alone, alone.views[index])
-            (losses.total / 2).backward(retain_graph=True)
+            (losses.total / 2).backward()
             seen.projection.means2d.grad *= 2
             alone.density.gather(seen)
             both.append(losses)

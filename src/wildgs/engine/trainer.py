@@ -188,15 +188,11 @@ class Trainer:
         output, losses = self._forward(view, photo, keep)
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
-            seen = SeenView(
-                output.projection,
-                output.rendering.colors,
-                output.painted,
-                photo,
-                self._static_pixels(output, keep),
-            )
+            static = self._static_pixels(output, keep)
+            seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, static)
+            seen = self.density.before_backward(seen)
         skipped = self._report_marked()
-        losses.total.backward(retain_graph=seen is not None and self.density.reuses_blend)
+        losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
         skipped = self._take(seen, losses) or skipped
         before = self.step

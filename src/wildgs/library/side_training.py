@@ -31,7 +31,8 @@ def training_beside(
     """Trains a run in another process during the block, on a quarter of the threads and at least one.
 
     It is an optimisation only: the caller continues or repeats the training afterwards, which finds a finished run
-    unless the process has failed. There is no process on a GPU or with a single thread.
+    unless the process has failed. There is no process on a GPU, with a single thread, or where Python is
+    embedded in another program.
 
     Args:
         config: Configuration of the run.
@@ -43,7 +44,7 @@ def training_beside(
         process, or None.
     """
     total = execution.threads or thread_count()
-    if default_device().type != "cpu" or total < 2:
+    if default_device().type != "cpu" or total < 2 or not sys.executable:
         yield (lambda _: None), None
         return
     share = max(1, total // 4)

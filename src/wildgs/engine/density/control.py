@@ -50,6 +50,8 @@ class SeenView:
         painted: Colours of the Gaussians, of which `colors` is blended.
         photo: RGB in [0, 1].
         counts: Mask of the photo's pixels that are neither transient nor masked by the user; None for all.
+        blended: What `DensityControl.before_backward` computed: for each Gaussian sums over pixels, weighted by its
+            share of the pixel; defined by the strategy.
     """
 
     projection: Projection
@@ -57,6 +59,7 @@ class SeenView:
     painted: Float[Tensor, "N 3"]
     photo: Float[Tensor, "H W 3"]
     counts: Bool[Tensor, "H W"] | None = None
+    blended: Float[Tensor, "N S"] | None = None
 
     @property
     def error(self) -> Float[Tensor, "H W"]:
@@ -74,8 +77,6 @@ class DensityControl(ABC):
     """Share of the training steps after which densification ends."""
     absgrad: bool = False
     """Whether the strategy needs `Projection.absgrad`."""
-    reuses_blend: bool = False
-    """Whether `measure` runs the backward pass of the step's blend once more, for which its graph is kept."""
 
     def __init__(
         self, config: DensityConfig, extent: float, num_gaussians: int, device: torch.device | str = "cpu"
@@ -110,6 +111,10 @@ class DensityControl(ABC):
     def measures(self, step: int) -> bool:
         """Whether the strategy gathers statistics in this step."""
         return True
+
+    def before_backward(self, view: SeenView) -> SeenView:
+        """Completes a view before the step's backward pass, which frees the graph; by default does nothing."""
+        return view
 
     @abstractmethod
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:

@@ -10,6 +10,8 @@ et al. 2024).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -35,7 +37,6 @@ class RelocationDensity(DensityControl):
 
     resets = False
     until = 0.8
-    reuses_blend = True
 
     def _clear(self, num_gaussians: int) -> None:
         super()._clear(num_gaussians)
@@ -52,12 +53,18 @@ class RelocationDensity(DensityControl):
         """Whether this is one of every `MEASURE_EVERY` steps."""
         return step % MEASURE_EVERY == 0
 
-    def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
-        """Blending-weighted sums over pixels for each Gaussian: image error, and 1."""
+    def before_backward(self, view: SeenView) -> SeenView:
+        """Adds blending-weighted sums over pixels of the image error, and of 1."""
         error = view.error
         # A pixel's gradient to a Gaussian's colour is the Gaussian's blending weight, whatever the colours are.
         weights = torch.stack([error, torch.ones_like(error), torch.zeros_like(error)], dim=-1)
-        covered, pixels, _ = torch.autograd.grad(view.colors, view.painted, weights)[0].unbind(1)
+        (sums,) = torch.autograd.grad(view.colors, view.painted, weights, retain_graph=True)
+        return replace(view, blended=sums)
+
+    def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
+        """The sums of `before_backward` for visible Gaussians: of the image error, and of 1."""
+        assert view.blended is not None
+        covered, pixels, _ = view.blended.unbind(1)
         visible = view.projection.visible if sound is None else view.projection.visible & sound
         return ViewStatistics(
             demand=torch.where(visible, covered, 0.0),
