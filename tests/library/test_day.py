@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
@@ -19,6 +21,8 @@ from wildgs.library import day as day_module
 from wildgs.library.config import TrajectoryOptions
 from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day, read_captures
 from wildgs.light.day import plan_day
+from wildgs.light.shadows import SIDE, SunFinder
+from wildgs.model.appearance import Appearance
 from wildgs.scene.capture import Capture, carry_capture
 
 
@@ -151,3 +155,32 @@ def test_a_run_with_one_light_has_no_day(run: Path, monkeypatch: pytest.MonkeyPa
     (run / DAY_FILE).unlink(missing_ok=True)
     with pytest.raises(UserError, match="needs a run that can be relit"):
         find_day(scene)
+
+
+def test_a_day_keeps_small_masks(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of 200 photos are in memory at once; a small mask tells the same pixels apart."""
+    large = torch.zeros(1800, 2400)
+    large[:, 1200:] = 1.0
+    small = day_module._small(large)
+    assert max(small.shape) < 2 * SIDE
+    assert small.untyped_storage().nbytes() < large.untyped_storage().nbytes() / 50
+    assert small.shape[1] * 3 == small.shape[0] * 4
+    assert small.mean() == pytest.approx(0.5, abs=0.01)
+    assert day_module._small(torch.ones(6, 8)).shape == (6, 8)
+
+    scene, encode, kept = wildgs.load(run), day_module.encode_view, []
+
+    def with_large_mask(*given: object) -> Appearance:
+        return replace(encode(*given), visibility=large)
+
+    def keep(self: SunFinder, photo: object, camera: object, masks: tuple) -> torch.Tensor:
+        kept.append(masks[1])
+        return torch.zeros(3)
+
+    monkeypatch.setattr(day_module, "encode_view", with_large_mask)
+    monkeypatch.setattr(SunFinder, "direction", keep)
+    (run / DAY_FILE).unlink(missing_ok=True)
+    find_day(scene)
+    (run / DAY_FILE).unlink()
+    assert len(kept) == len(day_module._usable_views(scene))
+    assert all(mask.untyped_storage().nbytes() < 4 * (2 * SIDE) ** 2 for mask in kept)

@@ -6,7 +6,8 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -68,7 +69,8 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
     places = [capture.place for capture in captures.values() if capture.place is not None]
     place = tuple(np.median(places, axis=0).tolist()) if places else None
     times = {name: phase_of(capture, place) for name, capture in _comparable(captures, place).items()}
-    day = plan_day(_patterns(loaded, views, progress), times)
+    lights = _lights(loaded, views, progress)
+    day = plan_day(lights.patterns, times, partial(_find_suns, loaded, views, lights))
     assert day is not None  # there are enough photos
     try:
         with written_aside(kept) as aside:
@@ -98,23 +100,37 @@ def _usable_views(loaded: LoadedScene) -> list[View]:
     return [views[index * len(views) // count] for index in range(count)]
 
 
-def _patterns(loaded: LoadedScene, views: list[View], progress: Progress | None) -> dict[str, Pattern]:
+@dataclass(frozen=True)
+class _Lights:
+    """The lights of some photos: their patterns and masks, and the mean harmonics of all Gaussians."""
+
+    patterns: dict[str, Pattern]
+    masks: list[Tensor | None]
+    rows: Tensor
+    mean: Tensor
+
+
+def _lights(loaded: LoadedScene, views: list[View], progress: Progress | None) -> _Lights:
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
-    mean, lights, masks = torch.zeros((), device=rows.device), [], []
+    mean, patterns, masks = torch.zeros((), device=rows.device), {}, []
     for number, view in enumerate(views, start=1):
         appearance = encode_view(method, view)
         sh = method.shade(appearance)
         mean = mean + sh / len(views)
-        lights.append(sh[rows])
+        patterns[view.name] = pattern_of(sh[rows])
         masks.append(None if appearance.visibility is None else _small(appearance.visibility))
         show(number, len(views))
-    finder = SunFinder(method.gaussians, method.sky(), rows, mean)
-    found = {}
-    for view, sh, mask in zip(views, lights, masks, strict=True):
-        photo, keep = view.load(rows.device)
-        found[view.name] = pattern_of(sh, finder.direction(photo, view.camera, (keep, mask)))
-    return found
+    return _Lights(patterns, masks, rows, mean)
+
+
+def _find_suns(loaded: LoadedScene, views: list[View], lights: _Lights) -> Float[np.ndarray, "P 3"]:
+    method = loaded.run.method
+    finder, suns = SunFinder(method.gaussians, method.sky(), lights.rows, lights.mean), []
+    for view, mask in zip(views, lights.masks, strict=True):
+        photo, keep = view.load(lights.rows.device)
+        suns.append(finder.direction(photo, view.camera, (keep, mask)))
+    return torch.stack(suns).double().cpu().numpy()
 
 
 def _digest(captures: dict[str, Capture]) -> str:

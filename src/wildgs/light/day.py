@@ -9,7 +9,7 @@ photos are warm, and lit sides are warmer than shaded ones).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,12 +53,10 @@ class Pattern:
     Attributes:
         luminance: Log luminance of some Gaussians minus its mean.
         warmth: Logarithm of red over blue of the same Gaussians.
-        sun: Estimated direction of the sun in the aligned frame (`SunFinder.direction`).
     """
 
     luminance: Float[np.ndarray, " M"]
     warmth: Float[np.ndarray, " M"]
-    sun: Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
@@ -92,21 +90,27 @@ def visible_rows(method: Method, centres: Float[Tensor, "V 3"]) -> Tensor:
     return area.topk(min(GAUSSIANS, len(area))).indices
 
 
-def pattern_of(sh: Float[Tensor, "M K 3"], sun: Float[Tensor, "3"]) -> Pattern:
-    """The pattern of a light on some Gaussians (`visible_rows`), with the estimated direction of the sun."""
+def pattern_of(sh: Float[Tensor, "M K 3"]) -> Pattern:
+    """The pattern of a light on some Gaussians (`visible_rows`)."""
     shown = (0.5 + C0 * sh[:, 0]).clamp(0.01, 1.2).double().cpu().numpy()
     linear = shown**2.2
     luminance = np.log(linear @ np.array([0.2126, 0.7152, 0.0722]))
     warmth = np.log(linear[:, 0] / linear[:, 2])
-    return Pattern(luminance - luminance.mean(), warmth, sun.double().cpu().numpy())
+    return Pattern(luminance - luminance.mean(), warmth)
 
 
-def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day | None:
+def plan_day(
+    patterns: Mapping[str, Pattern],
+    times: Mapping[str, float],
+    find_suns: Callable[[], Float[np.ndarray, "P 3"]],
+) -> Day | None:
     """Orders photos by the elevation of the sun and selects key photos.
 
     Args:
         patterns: Patterns of the photos' lights, by name.
         times: Phases of the day (`wildgs.light.sun.phase_of`) of photos with a capture time.
+        find_suns: Estimates the direction of the sun in each photo, in the order of `patterns`, in the aligned
+            frame (`SunFinder.direction`). Called only if the times do not decide.
 
     Returns:
         None if there are fewer than `LEAST_PHOTOS` photos.
@@ -128,9 +132,10 @@ def plan_day(patterns: Mapping[str, Pattern], times: Mapping[str, float]) -> Day
             }
             chosen = [index for index, keep in zip(timed, kept, strict=True) if keep]
             return _day(names, axes, np.array(chosen), phases[kept], left, by_time=True)
-    known = list(patterns.values())
-    height = _learn(_by_variance(luminance), _rough_height(known), _PATTERN_RIDGE)
-    rising = _is_morning(np.stack([pattern.sun for pattern in known]))
+    suns = find_suns()
+    rough = _rough_height(list(patterns.values()), suns[:, 2])
+    height = _learn(_by_variance(_without_tone(luminance)), rough, _PATTERN_RIDGE)
+    rising = _is_morning(suns)
     rank = (height.argsort().argsort() + 0.5) / len(names) * 180 - 90
     phases = np.where(rising, rank, 180 - rank)
     return _day(names, axes, np.arange(len(names)), phases, {}, by_time=False)
@@ -149,16 +154,30 @@ def _by_variance(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P _"
     return left * spread * np.sqrt(len(luminance)) / max(np.linalg.norm(spread), 1e-12)
 
 
-def _rough_height(patterns: Sequence[Pattern]) -> Float[np.ndarray, " P"]:
-    """An estimate of the ranks of the sun's elevations, scaled to -0.5 to 0.5."""
+def _without_tone(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P M"]:
+    """The patterns less what a quadratic function of the mean pattern explains.
+
+    Contrast and tone curves of cameras make the luminance of a Gaussian depend on that under the mean light.
+    """
+    mean = luminance.mean(axis=0)
+    basis = np.linalg.qr(np.vander(mean / max(mean.std(), 1e-9), 3))[0]
+    return luminance - luminance @ basis @ basis.T
+
+
+def _rough_height(patterns: Sequence[Pattern], shadows: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    """An estimate of the ranks of the sun's elevations, scaled to -0.5 to 0.5.
+
+    Args:
+        patterns: Patterns of the photos' lights.
+        shadows: Upward component of the directions of the sun.
+    """
     luminance, warmth = (
         np.stack(values) - np.mean(values, axis=0)
         for values in ([each.luminance for each in patterns], [each.warmth for each in patterns])
     )
     lit_warmer = ((warmth - warmth.mean(axis=1, keepdims=True)) * luminance).mean(axis=1)
     colors = _ranks(-_ranks(warmth.mean(axis=1)) - _ranks(lit_warmer))
-    shadows = _ranks(np.array([pattern.sun[2] for pattern in patterns]))
-    return _ranks(colors + 2 * shadows)  # shadows are the better estimate (docs/decisions.md)
+    return _ranks(colors + 2 * _ranks(shadows))  # shadows are the better estimate (docs/decisions.md)
 
 
 def _ranks(values: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:

@@ -2,7 +2,7 @@
 
 For a grid of directions, shadow maps of the Gaussians predict which pixels of a photo the sun lights, and how
 steeply. The direction whose prediction correlates best with the brightness of the photo, relative to the scene
-under its mean light, is taken to be that of the sun. Exposure and white balance cancel out.
+under its mean light, is taken to be that of the sun. Exposure, white balance and contrast cancel out.
 """
 
 from __future__ import annotations
@@ -125,14 +125,13 @@ class SunFinder:
         chosen = chosen[:: max(1, len(chosen) // _PIXELS)]
         if len(chosen) < 100:
             return torch.zeros(len(self.directions), device=device)
-        brightness = _log_luminance(_reduced(photo, camera)) - _log_luminance(rendering.colors)
-        brightness = brightness.flatten()[chosen]
+        usual = _log_luminance(rendering.colors).flatten()[chosen]
+        brightness = _log_luminance(_reduced(photo, camera)).flatten()[chosen] - usual
         brightness = (brightness - brightness.median()).clamp(-1.5, 1.5)
         predicted = self._predictions(
             points.reshape(-1, 3)[chosen], _normals(points, camera).reshape(-1, 3)[chosen]
         )
-        predicted -= predicted.mean(dim=1, keepdim=True)
-        brightness -= brightness.mean()
+        predicted, brightness = _without_tone(predicted, usual), _without_tone(brightness, usual)
         return predicted @ brightness / (predicted.norm(dim=1) * brightness.norm()).clamp_min(1e-9)
 
     def _predictions(
@@ -162,6 +161,13 @@ def _directions() -> Float[Tensor, "D 3"]:
 
 def _log_luminance(colors: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     return (colors.clamp(0.02, 1.0) ** 2.2 @ colors.new_tensor([0.2126, 0.7152, 0.0722])).log()
+
+
+def _without_tone(values: Float[Tensor, "*D P"], usual: Float[Tensor, " P"]) -> Float[Tensor, "*D P"]:
+    """Values less what a quadratic function of the usual brightness explains: exposure and tone curve."""
+    scaled = (usual - usual.mean()) / usual.std().clamp_min(1e-6)
+    basis = torch.linalg.qr(torch.stack([torch.ones_like(scaled), scaled, scaled.square()], dim=1))[0]
+    return values - values @ basis @ basis.T
 
 
 def _reduced(image: Float[Tensor, "h w C"], camera: Camera) -> Float[Tensor, "H W C"]:
