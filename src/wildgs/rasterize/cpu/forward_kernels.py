@@ -170,7 +170,7 @@ def blend_forward(
                         first = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
                             to = at + (k + COLORS) * LANES
-                            vstore(sums, to, fma(weight, values[first + k], vload(sums, to)))
+                            vstore(sums, to, fma(weight, vspread(values, first + k), vload(sums, to)))
                 vstore(sums, at, before)
                 vstore(sums, at + LANES, px)
                 vstore(sums, at + 2 * LANES, total)
