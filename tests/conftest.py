@@ -72,7 +72,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     Parts of the suite run in this process: each worker has to import everything and to make its own fixtures. `-n`
     overrides this.
     """
-    if "PYTEST_XDIST_WORKER" in os.environ:  # workers call this hook, too, and would start workers of their own
+    # Workers call this hook, too, and would start workers of their own.
+    if "PYTEST_XDIST_WORKER" in os.environ:
         return
     whole = (
         config.args_source != config.ArgsSource.ARGS
