@@ -33,8 +33,8 @@ from PIL import Image
 
 import wildgs
 from benchmarks.page_fps import FLAGS
-from wildgs.exporters.page import choose_start
 from wildgs.geometry.camera import Camera
+from wildgs.library.day import start_view
 from wildgs.library.loaded import LoadedScene
 
 HERE = Path(__file__).parent / "readers"
@@ -83,11 +83,9 @@ def read_camera(file: Path) -> dict:
 
 def start_camera(loaded: LoadedScene, yfov: float) -> Camera:
     """The camera of the start view with a centred principal point."""
-    views = loaded.scene.train_views
-    camera = views[choose_start([view.camera for view in views], loaded.scene.points)[0]].camera
     focal = 0.5 * HEIGHT / math.tan(yfov / 2)
     K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(camera.viewmat, K, WIDTH, HEIGHT)
+    return Camera(start_view(loaded).camera.viewmat, K, WIDTH, HEIGHT)
 
 
 def check_usd(file: Path) -> None:

@@ -21,6 +21,7 @@ from wildgs.exporters.glb import glb_bytes
 from wildgs.exporters.lights import ExportLight, RelightableScene, share_harmonics, upright
 from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
 from wildgs.exporters.splats import CleanupConfig, Splats
+from wildgs.library.day import start_view
 from wildgs.library.loaded import LoadedScene, find_looks
 from wildgs.library.pages import baked, viewpoints_of
 from wildgs.model.gaussians import NEAR
@@ -63,11 +64,14 @@ def repeat_splats(splats: Splats, count: int) -> Splats:
 
 def print_glb(loaded: LoadedScene, lights: list[Splats], names: list[str], count: int) -> None:
     motion = upright(loaded.run.alignment, aligned=False)
-    views = loaded.scene.train_views
-    start = views[choose_start([view.camera for view in views], loaded.scene.points)[0]]
+    start = start_view(loaded)
     splats = repeat_splats(lights[0], count)
     shs = [splats.with_sh(repeat(each.sh, count, 0.02)).moved(motion).sh for each in lights]
-    moved, viewpoints, single = splats.moved(motion), motion.apply_points(viewpoints_of(views)), 0
+    moved, viewpoints, single = (
+        splats.moved(motion),
+        motion.apply_points(viewpoints_of(loaded.scene.train_views)),
+        0,
+    )
     for number in LIGHTS:
         harmonics = share_harmonics(moved, shs[:number], viewpoints, CleanupConfig().own_harmonics)
         shown = [

@@ -23,8 +23,7 @@ from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
 CONFIG_FILE = "config.yaml"
 MAX_CONFIG_BYTES = 1_000_000
-BUDGET = "train.density.max_gaussians"
-"""The only entry that may change when a run is resumed, since it depends on the machine's memory."""
+BUDGET = "train.density.max_gaussians"  # the only entry that may change when a run is resumed
 
 _BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
 """First and last line, to detect truncation: a truncated file could still be valid YAML with entries missing."""
@@ -397,7 +396,5 @@ def edited_entries(config: RunConfig, plain: Any) -> str:
 def _flat(plain: Any, path: str = "") -> dict[str, Any]:
     if not isinstance(plain, dict):
         return {path: plain}
-    flat: dict[str, Any] = {}
-    for name, value in plain.items():
-        flat |= _flat(value, f"{path}.{name}" if path else name)
-    return flat
+    parts = (_flat(value, f"{path}.{name}" if path else name) for name, value in plain.items())
+    return {key: value for part in parts for key, value in part.items()}

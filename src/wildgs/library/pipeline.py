@@ -28,6 +28,7 @@ from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_an
 from wildgs.priors.stereo.depth import fill_metric_folder
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import Run, default_device, load_run, lock_run
+from wildgs.scene import Scene
 from wildgs.scene.config import DataConfig
 from wildgs.scene.demo import write_demo_scene
 from wildgs.sfm.config import SfmConfig
@@ -290,15 +291,14 @@ def demo(
     with lock_run(output):
         folder = write_demo_scene(output / "scene")
         first, second = (_configuration(folder, method, steps) for method in COMPARED)
-        runs = []
+        scene, runs = read_scene(first, execution, progress), []
         with training_beside(second, output / second.method, execution) as (give_threads, beside):
             own = replace(execution, threads=None) if beside else execution
-            runs.append(_train_and_score(first, output, own, progress, [*observers, give_threads]))
+            runs.append(_train_and_score(first, scene, output, own, progress, [*observers, give_threads]))
             if beside is not None and beside.poll() is None:
                 logger.info(f"waiting for the training of {second.method}")
                 beside.wait()
-        runs.append(_train_and_score(second, output, execution, progress, observers))
-        scene = read_scene(first, execution)
+        runs.append(_train_and_score(second, scene, output, execution, progress, observers))
         write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
         write_scene_page(runs[0][1], page, TITLE, progress)
     return FinishedRun(output, {name: scores for name, _, scores in runs}, report, page)
@@ -306,13 +306,13 @@ def demo(
 
 def _train_and_score(
     config: RunConfig,
+    scene: Scene,
     output: Path,
     execution: ExecutionConfig,
     progress: Progress | None,
     observers: Sequence[Observer],
 ) -> tuple[str, Run, Scores]:
     """Trains, or continues, a run of the demo; returns its label, the run and its scores."""
-    scene = read_scene(config, execution, progress)
     folder = output / config.method
     train(
         scene,

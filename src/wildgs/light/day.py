@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import C0
+from wildgs.light.shadows import without_tone
 from wildgs.light.sun import NOON
 from wildgs.model.method import Method
 
@@ -134,7 +135,8 @@ def plan_day(
             return _day(names, axes, np.array(chosen), phases[kept], left, by_time=True)
     suns = find_suns()
     rough = _rough_height(list(patterns.values()), suns[:, 2])
-    height = _learn(_by_variance(_without_tone(luminance)), rough, _PATTERN_RIDGE)
+    toneless = without_tone(torch.from_numpy(luminance), torch.from_numpy(luminance.mean(axis=0))).numpy()
+    height = _learn(_by_variance(toneless), rough, _PATTERN_RIDGE)
     rising = _is_morning(suns)
     rank = (height.argsort().argsort() + 0.5) / len(names) * 180 - 90
     phases = np.where(rising, rank, 180 - rank)
@@ -152,16 +154,6 @@ def _by_variance(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P _"
     """All principal components of the patterns, unwhitened, with a total variance of 1."""
     left, spread, _ = np.linalg.svd(luminance - luminance.mean(axis=0), full_matrices=False)
     return left * spread * np.sqrt(len(luminance)) / max(np.linalg.norm(spread), 1e-12)
-
-
-def _without_tone(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P M"]:
-    """The patterns less what a quadratic function of the mean pattern explains.
-
-    Contrast and tone curves of cameras make the luminance of a Gaussian depend on that under the mean light.
-    """
-    mean = luminance.mean(axis=0)
-    basis = np.linalg.qr(np.vander(mean / max(mean.std(), 1e-9), 3))[0]
-    return luminance - luminance @ basis @ basis.T
 
 
 def _rough_height(patterns: Sequence[Pattern], shadows: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:

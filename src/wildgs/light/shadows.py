@@ -131,7 +131,7 @@ class SunFinder:
         predicted = self._predictions(
             points.reshape(-1, 3)[chosen], _normals(points, camera).reshape(-1, 3)[chosen]
         )
-        predicted, brightness = _without_tone(predicted, usual), _without_tone(brightness, usual)
+        predicted, brightness = without_tone(predicted, usual), without_tone(brightness, usual)
         return predicted @ brightness / (predicted.norm(dim=1) * brightness.norm()).clamp_min(1e-9)
 
     def _predictions(
@@ -163,8 +163,8 @@ def _log_luminance(colors: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     return (colors.clamp(0.02, 1.0) ** 2.2 @ colors.new_tensor([0.2126, 0.7152, 0.0722])).log()
 
 
-def _without_tone(values: Float[Tensor, "*D P"], usual: Float[Tensor, " P"]) -> Float[Tensor, "*D P"]:
-    """Values less what a quadratic function of the usual brightness explains: exposure and tone curve."""
+def without_tone(values: Float[Tensor, "*D P"], usual: Float[Tensor, " P"]) -> Float[Tensor, "*D P"]:
+    """Values less what a quadratic function of the usual brightness explains: exposure, contrast and tone curve."""
     scaled = (usual - usual.mean()) / usual.std().clamp_min(1e-6)
     basis = torch.linalg.qr(torch.stack([torch.ones_like(scaled), scaled, scaled.square()], dim=1))[0]
     return values - values @ basis @ basis.T
