@@ -9,11 +9,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildgs.model.light_basis import LEAST_PIXELS, LightBasis, fit_weights
+from wildgs.geometry.spherical_harmonics import sh_values
+from wildgs.model.light_basis import BLENDED_AT_ONCE, LEAST_PIXELS, LightBasis, fit_weights
 from wildgs.model.photo_match import FIT_SIDE, Sight
 from wildgs.model.registry import restore_method
 from wildgs.model.training_pass import SeenPhoto
 from wildgs.model.wildgs import WildGS
+from wildgs.rasterize import blend
 
 
 @pytest.fixture
@@ -86,6 +88,21 @@ def test_components_span_the_lights_with_unit_variance(make_wall_model) -> None:
     rows = torch.tensor([4, 1, 100])
     weights = torch.randn(5, generator=generator)
     torch.testing.assert_close(basis.harmonics(weights, rows), basis.harmonics(weights)[rows])
+
+
+@pytest.mark.parametrize("count", [1, BLENDED_AT_ONCE, BLENDED_AT_ONCE + 3])
+def test_components_blended_together_are_those_blended_alone(camera, make_wall_model, count: int) -> None:
+    model, basis = make_wall_model(), LightBasis()
+    generator = torch.Generator().manual_seed(count)
+    basis.components = torch.randn(count, model.num_gaussians, 4, 3, generator=generator).half()
+    with torch.no_grad():
+        projection, means = model.gaussians.project(camera), model.gaussians.means.detach()
+        found = basis._images(projection, means)
+        assert len(found) == count
+        for image, component in zip(found, basis.components, strict=True):
+            colors = sh_values(component.float(), means - camera.position)
+            alone = blend(projection, colors, depth=False).colors
+            torch.testing.assert_close(image, alone, atol=1e-5, rtol=1e-4)
 
 
 def test_two_lights_are_no_basis(camera, make_wall_model) -> None:
