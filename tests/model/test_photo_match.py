@@ -12,6 +12,7 @@ from wildgs.model.config import SkyConfig, WildGSConfig
 from wildgs.model.method import Stage
 from wildgs.model.photo_match import PhotoMatch
 from wildgs.model.registry import restore_method
+from wildgs.model.sky import sine_of_elevation
 
 
 def grey_photo(camera, value: float) -> torch.Tensor:
@@ -88,5 +89,9 @@ def test_colours_change_in_training_as_harmonics_do(points: int, light_codes: in
     colors, intrinsic = torch.rand(50, 3), torch.randn(50, 32)
     harmonics = ((colors - 0.5) / C0)[:, None]
     expected = 0.5 + C0 * match.harmonics(harmonics, change, means, intrinsic, centre)[:, 0]
-    codes = match.light_codes(intrinsic)
-    torch.testing.assert_close(match.changed(colors, change, means, codes, centre), expected)
+    sky = match.sky(means, centre)
+    above = torch.zeros(50, dtype=torch.bool) if sky is None else sky.which
+    codes = match.light_codes(intrinsic[~above])
+    ordered = torch.cat([colors[~above], colors[above]])
+    changed = match.changed(ordered, change, codes, sine_of_elevation(means[above], centre))
+    torch.testing.assert_close(changed, torch.cat([expected[~above], expected[above]]))

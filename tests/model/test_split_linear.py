@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from wildgs.model.fusion import PARTS, SplitLinear
+from wildgs.model.fusion_layers import PARTS, SplitLinear
 
 
 @pytest.mark.parametrize("count", [3, PARTS, 2 * PARTS + 5])

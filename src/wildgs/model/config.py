@@ -134,6 +134,8 @@ class SkyConfig:
         opacity: Initial opacity of the sky Gaussians.
         densify: Densify sky Gaussians as well. Clouds differ between photos and can then take up to half of all
             Gaussians.
+        own_fusion: Predict the colours of sky Gaussians by a fusion network of their own, from a global embedding
+            of their own, because clouds and haze follow other rules than the light on surfaces.
     """
 
     points: int = 5000
@@ -142,6 +144,7 @@ class SkyConfig:
     lowest: float = -90.0
     opacity: float = 0.5
     densify: bool = False
+    own_fusion: bool = True
 
 
 @dataclass(frozen=True)

@@ -2,59 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from wildgs import features
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.config import FusionConfig
+from wildgs.model.fusion_layers import ChunkedLayers, linear_over_rows
 from wildgs.model.precision import MixedModule
-
-PARTS = 128
-LEAST_ROWS = 64 * PARTS
-"""Smallest number of rows for `SplitLinear`."""
-
-
-def linear_over_rows(
-    rows: Float[Tensor, "N I"], weight: Float[Tensor, "O I"], bias: Float[Tensor, " O"]
-) -> Float[Tensor, "N O"]:
-    """``rows @ weight.T + bias``, one row per Gaussian, in the precision of the rows or of autocast."""
-    if rows.is_cuda and len(rows) >= LEAST_ROWS and features.is_on("split_weights"):
-        return SplitLinear.apply(rows, weight.to(rows.dtype), bias.to(rows.dtype))
-    return functional.linear(rows, weight, bias)
-
-
-class SplitLinear(torch.autograd.Function):
-    """`torch.nn.functional.linear` whose weight gradient is summed in `PARTS` parts, for operands of one dtype.
-
-    The gradient of a small weight matrix (64 x 48) is a reduction over all Gaussians. As one product it has a
-    single output tile, which occupies few of a GPU's multiprocessors.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Computes [N, O] from rows [N, I], weight [O, I] and bias [O]."""
-        ctx.save_for_backward(rows, weight)
-        return functional.linear(rows, weight, bias)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        """Gradients of rows, weight and bias."""
-        rows, weight = ctx.saved_tensors
-        gradient = gradients[0].to(rows.dtype)
-        by_rows = gradient @ weight if ctx.needs_input_grad[0] else None
-        whole = len(rows) // PARTS * PARTS
-        parts = (
-            gradient[:whole].view(PARTS, -1, weight.shape[0]),
-            rows[:whole].view(PARTS, -1, weight.shape[1]),
-        )
-        sums = torch.bmm(parts[0].transpose(1, 2), parts[1]).sum(0, dtype=torch.float32)
-        by_weight = sums + (gradient[whole:].T @ rows[whole:]).float()
-        return by_rows, by_weight.to(weight.dtype), gradient.sum(0)
 
 
 class Fusion(MixedModule):
@@ -86,6 +42,12 @@ class Fusion(MixedModule):
         if self.transform is not None:
             nn.init.zeros_(self.transform.weight)
             nn.init.zeros_(self.transform.bias)
+        self.sky: Fusion | None = None
+        """Network of the sky's Gaussians, which have no local embeddings; None: they share this one."""
+
+    def separate_sky(self) -> None:
+        """Gives the sky's Gaussians a network and a global embedding of their own. Not in the paper."""
+        self.sky = Fusion(self.config, self.first_global.in_features, local_size=0)
 
     def initial_intrinsic(self, colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P I"]:
         """Initial intrinsic features: the SH coefficients of the colours, followed by small noise."""
@@ -111,6 +73,19 @@ class Fusion(MixedModule):
             color_map: Another colour transform [A | b], applied after the predicted one.
         """
         output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
+        if not intrinsic.is_cuda and _is_shared(local_embeddings):
+            fused = ChunkedLayers.apply(
+                intrinsic,
+                self.first_rows.weight[:, local_embeddings.shape[1] :],
+                self._first_bias(global_embedding, local_embeddings[0]),
+                self.second.weight,
+                self.second.bias,
+                output,
+                bias,
+                direct,
+                self.precision,
+            )
+            return fused.reshape(-1, self.coefficients, 3)
         with self.mixed(intrinsic.device):
             hidden = self._first_layer(global_embedding, local_embeddings, intrinsic).relu_()
             hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
@@ -120,6 +95,56 @@ class Fusion(MixedModule):
             fused = torch.addmm(fused, intrinsic, direct.T)
         return fused.reshape(-1, self.coefficients, 3)
 
+    def by_region(
+        self,
+        global_embedding: Float[Tensor, " G"],
+        local_embeddings: Float[Tensor, "V L"],
+        landmark: Float[Tensor, "A I"],
+        sky: Float[Tensor, "B I"],
+    ) -> Float[Tensor, "V K 3"]:
+        """SH coefficients of the landmark's Gaussians, followed by those of the sky.
+
+        Args:
+            global_embedding: Emb^g; with a network of the sky, that of the landmark followed by that of the sky.
+            local_embeddings: Emb^l of all Gaussians in this order.
+            landmark: f^in of the landmark's Gaussians.
+            sky: f^in of the sky's Gaussians.
+        """
+        if self.sky is None:
+            return self(global_embedding, local_embeddings, torch.cat([landmark, sky]))
+        common, of_sky = global_embedding.chunk(2)
+        parts = [self(common, local_embeddings[: len(landmark)], landmark)]
+        if len(sky):
+            parts.append(self.sky(of_sky, _no_local(sky), sky))
+        return torch.cat(parts)
+
+    def with_sky(
+        self,
+        global_embedding: Float[Tensor, " G"],
+        local_embeddings: Float[Tensor, "N L"],
+        intrinsic: Float[Tensor, "N I"],
+        which: Bool[Tensor, " N"] | None,
+        color_map: Float[Tensor, "3 4"] | None = None,
+    ) -> Float[Tensor, "N K 3"]:
+        """Like `by_region` for Gaussians in any order.
+
+        Args:
+            global_embedding: As in `by_region`.
+            local_embeddings: Emb^l.
+            intrinsic: f^in.
+            which: Sky Gaussians; None if there are none.
+            color_map: As in `forward`.
+        """
+        if self.sky is None:
+            return self(global_embedding, local_embeddings, intrinsic, color_map)
+        common, of_sky = global_embedding.chunk(2)
+        harmonics = self(common, local_embeddings, intrinsic, color_map)
+        if which is None:
+            return harmonics
+        rows = which.nonzero()[:, 0]
+        above = intrinsic[rows]
+        return harmonics.index_copy(0, rows, self.sky(of_sky, _no_local(above), above, color_map))
+
     def _first_layer(
         self,
         global_embedding: Float[Tensor, " G"],
@@ -127,15 +152,21 @@ class Fusion(MixedModule):
         intrinsic: Float[Tensor, "N I"],
     ) -> Float[Tensor, "N H"]:
         """The first layer before its ReLU."""
-        of_all, weight = self.first_global(global_embedding), self.first_rows.weight
+        weight = self.first_rows.weight
         intrinsic = intrinsic.to(self.precision)
-        if local_embeddings.stride(0) == 0 and len(local_embeddings) > 1:  # the expanded v, the same for all
-            local = local_embeddings.shape[1]
-            of_all = of_all + functional.linear(local_embeddings[:1], weight[:, :local])[0]
-            return linear_over_rows(intrinsic, weight[:, local:], of_all)
+        if _is_shared(local_embeddings):
+            bias = self._first_bias(global_embedding, local_embeddings[0])
+            return linear_over_rows(intrinsic, weight[:, local_embeddings.shape[1] :], bias)
         # Converted before concatenation, which would otherwise copy both in full precision.
         rows = torch.cat([local_embeddings.to(self.precision), intrinsic], dim=1)
-        return linear_over_rows(rows, weight, of_all)
+        return linear_over_rows(rows, weight, self.first_global(global_embedding))
+
+    def _first_bias(
+        self, global_embedding: Float[Tensor, " G"], local_embedding: Float[Tensor, " L"]
+    ) -> Float[Tensor, " H"]:
+        """Contribution to the first layer of embeddings that are the same for all Gaussians."""
+        by_local = self.first_rows.weight[:, : len(local_embedding)]
+        return self.first_global(global_embedding) + functional.linear(local_embedding, by_local)
 
     def _change(
         self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None
@@ -170,3 +201,13 @@ class Fusion(MixedModule):
         offset = torch.cat([flat, flat.new_zeros(3 * self.coefficients - 3)])
         mapped = None if direct is None else colors_mapped(direct)
         return colors_mapped(output), mapped, colors_mapped(bias[:, None])[:, 0] + offset
+
+
+def _is_shared(local_embeddings: Float[Tensor, "N L"]) -> bool:
+    """Whether the local embeddings are one embedding, expanded to all Gaussians (the learnt v)."""
+    return local_embeddings.stride(0) == 0 and len(local_embeddings) > 1
+
+
+def _no_local(rows: Float[Tensor, "N I"]) -> Float[Tensor, "N 0"]:
+    """Local embeddings of length 0."""
+    return rows.new_zeros(1, 0).expand(len(rows), 0)

@@ -116,15 +116,38 @@ ROWS_STEP = 1024
 """On the CPU, rows are shaded in multiples of this, because oneDNN compiles matrix products for every new shape."""
 
 
-def rows_to_shade(visible: Bool[Tensor, "N"]) -> Int[Tensor, " V"]:
-    """Indices of the visible Gaussians, on the CPU padded by others to a multiple of `ROWS_STEP`."""
+def rows_to_shade(visible: Bool[Tensor, "N"], among: Bool[Tensor, "N"] | None = None) -> Int[Tensor, " V"]:
+    """Indices of the visible Gaussians, on the CPU padded by others to a multiple of `ROWS_STEP`.
+
+    Args:
+        visible: Visible Gaussians.
+        among: Gaussians from which the others are taken; None for all.
+    """
     rows = visible.nonzero()[:, 0]
-    if visible.device.type != "cpu":
+    if visible.device.type != "cpu" or len(rows) % ROWS_STEP == 0:
         return rows
-    missing = min(-len(rows) % ROWS_STEP, len(visible) - len(rows))
-    if missing == 0:
-        return rows
-    return torch.cat([rows, (~visible).nonzero()[:missing, 0]])
+    others = ~visible if among is None else among & ~visible
+    return torch.cat([rows, others.nonzero()[: -len(rows) % ROWS_STEP, 0]])
+
+
+def rows_by_group(visible: Bool[Tensor, "N"], group: Bool[Tensor, "N"]) -> tuple[Int[Tensor, " V"], int]:
+    """Like `rows_to_shade`, first all rows outside of a group, then those of the group.
+
+    Args:
+        visible: Visible Gaussians.
+        group: The group.
+
+    Returns:
+        Indices, and how many of them are outside of the group.
+    """
+    outside = ~group
+    if visible.device.type == "cpu":
+        first = rows_to_shade(visible & outside, outside)
+        return torch.cat([first, rows_to_shade(visible & group, group)]), len(first)
+    # One synchronisation, for both sizes.
+    first, second = torch.stack([visible & outside, visible & group]).sum(dim=1).tolist()
+    keys = torch.where(visible, group, 2).to(torch.uint8)
+    return keys.argsort(stable=True)[: first + second], first
 
 
 def take_rows(values: Float[Tensor, "N *rest"], rows: Int[Tensor, " V"]) -> Float[Tensor, "V *rest"]:

@@ -167,27 +167,29 @@ class PhotoMatch(nn.Module):
         self,
         colors: Float[Tensor, "V 3"],
         change: Float[Tensor, "3 M"],
-        means: Float[Tensor, "V 3"],
-        codes: Float[Tensor, "V L"],
-        centre: Float[Tensor, " 3"],
+        codes: Float[Tensor, "L C"],
+        elevation: Float[Tensor, "S"],
     ) -> Float[Tensor, "V 3"]:
         """Applies a transform fitted in training, with a gain per channel, to colours of Gaussians.
 
         Colours and light codes get gradients. `harmonics` is the counterpart for harmonics.
+
+        Args:
+            colors: Colours of the landmark's Gaussians, followed by those of the sky.
+            change: From `find`.
+            codes: Light codes of the landmark's Gaussians.
+            elevation: Sines of the elevations of the sky's Gaussians.
         """
         own, by_code, of_sky, by_elevation = split_change(change, self.num_codes)
-        gains, offsets = 1 + own[:, :3].diagonal(), own[:, 3].expand(len(colors), 3)
-        below: Tensor | float = 1.0
-        sky = self.sky(means, centre)
-        if sky is not None:
-            which = sky.which[:, None]
-            below = ~which
-            gains = torch.where(which, 1 + of_sky[:, :3].diagonal(), gains)
-            elevated = torch.addmm(of_sky[:, 3], elevation_powers(sky.sine), by_elevation.T)
-            offsets = torch.where(which, elevated, offsets)
-        if self.codes is not None:
-            offsets = offsets + below * (codes @ by_code.T)
-        return torch.addcmul(offsets, colors, gains)
+        landmark, sky = colors.tensor_split((len(codes),))
+        offsets = (
+            torch.addmm(own[:, 3], codes, by_code.T) if self.num_codes else own[:, 3].expand_as(landmark)
+        )
+        landmark = torch.addcmul(offsets, landmark, 1 + own[:, :3].diagonal())
+        if len(sky) == 0:
+            return landmark
+        elevated = torch.addmm(of_sky[:, 3], elevation_powers(elevation), by_elevation.T)
+        return torch.cat([landmark, torch.addcmul(elevated, sky, 1 + of_sky[:, :3].diagonal())])
 
     def harmonics(
         self,

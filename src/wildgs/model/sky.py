@@ -47,6 +47,14 @@ def find_sky(config: SkyConfig, points: Float[Tensor, "*batch 3"], centre: Float
     return Sky(distances > 0.5 * config.radius, offsets[..., 2] / distances.clamp_min(1e-6))
 
 
+def sine_of_elevation(
+    points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]
+) -> Float[Tensor, "*batch"]:
+    """Sine of the elevation of points in the aligned frame, seen from the scene's centre."""
+    offsets = points - centre
+    return offsets[..., 2] / offsets.norm(dim=-1).clamp_min(1e-6)
+
+
 def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor, "S 3"]:
     """Centres of the sky's Gaussians.
 

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
@@ -16,12 +17,20 @@ from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse
 from wildgs.model.dropout import opacity_factors
 from wildgs.model.encoder import Encoder, encoder_of
 from wildgs.model.fusion import Fusion
-from wildgs.model.gaussians import GEOMETRY_ROWS, Gaussians, rows_to_shade, spread_rows, take_rows
+from wildgs.model.gaussians import (
+    GEOMETRY_ROWS,
+    Gaussians,
+    rows_by_group,
+    rows_to_shade,
+    spread_rows,
+    take_rows,
+)
 from wildgs.model.initial import InitialGaussians
 from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
 from wildgs.model.photo_match import PhotoMatch, Sight
+from wildgs.model.sky import sine_of_elevation
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
@@ -55,13 +64,16 @@ class WildGS(Method):
         self.gaussians = gaussians
         gaussians.eps2d = config.eps2d
         self.sh_degree = config.fusion.sh_degree
-        self.global_size = config.parsing.global_size
+        sky_apart = bool(config.sky.points and config.sky.own_fusion)
+        self.global_size = (1 + sky_apart) * config.parsing.global_size
         self.local_size = config.wrapping.local_size
         self.mask_threshold = config.mask_threshold
         self.depth_supervised = not self._lacks("depth")
-        self.parsing = Parsing(config.parsing, encoder)
+        self.parsing = Parsing(config.parsing, encoder, embeddings=1 + sky_apart)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
+        if sky_apart:
+            self.fusion.separate_sky()
         self.light_basis = LightBasis()
         self.photo_match = PhotoMatch(config)
 
@@ -93,9 +105,11 @@ class WildGS(Method):
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
         """Creates the method with an untrained encoder and an arbitrary box."""
+        if not any(name.startswith("fusion.sky.") for name in state):  # checkpoint of an earlier version
+            config = replace(config, sky=replace(config.sky, own_fusion=False))
         box = Box(torch.zeros(3), torch.ones(3))
         model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
-        if "photo_match.codes.weight" not in state:  # checkpoint of an earlier version
+        if "photo_match.codes.weight" not in state:  # likewise
             model.photo_match.codes = None
         model.light_basis.components = state.get("light_basis.components")
         return model
@@ -192,28 +206,44 @@ class WildGS(Method):
         sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
         with torch.no_grad():
             colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
-            codes = self.photo_match.light_codes(self.gaussians.rows["intrinsic"])
+            codes = self._light_codes()
             values = torch.cat([colors, codes], dim=1)
             picture = self.photo_match.picture(sight.projection, values, self._centre)
             change = self.photo_match.find(sight, picture)
         return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
 
+    def _light_codes(self) -> Float[Tensor, "N L"]:
+        """Light codes of all Gaussians; those of the sky are 0, because its transform has none."""
+        codes, sky = self.photo_match.light_codes(self.gaussians.rows["intrinsic"]), self.sky()
+        return codes if sky is None else torch.where(sky[:, None], 0, codes)
+
     def _matched(
         self,
         colors: Float[Tensor, "V 3"],
-        means: Float[Tensor, "V 3"],
-        intrinsic: Float[Tensor, "V I"],
+        landmark: Float[Tensor, "L I"],
+        sky: Float[Tensor, "S 3"],
         rows: Int[Tensor, " V"],
         sight: Sight,
     ) -> Float[Tensor, "V 3"]:
-        """Applies the colour match, scaled by `matched_loss`, to colours of the given Gaussians in training."""
+        """Applies the colour match, scaled by `matched_loss`, to colours of Gaussians in training.
+
+        Args:
+            colors: Colours of the landmark's Gaussians, followed by those of the sky.
+            landmark: Intrinsic features of the landmark's Gaussians.
+            sky: Centres of the sky's Gaussians.
+            rows: Indices of the Gaussians.
+            sight: The photo.
+        """
         match, centre = self.photo_match, self._centre
-        codes = match.light_codes(intrinsic)
+        codes = match.light_codes(landmark)
         with torch.no_grad():
-            values = spread_rows(torch.cat([colors, codes], dim=1), rows, self.num_gaussians)
-            picture = match.picture(sight.projection, values, centre, training=True)
+            values = torch.cat([colors, functional.pad(codes, (0, 0, 0, len(sky)))], dim=1)
+            picture = match.picture(
+                sight.projection, spread_rows(values, rows, self.num_gaussians), centre, training=True
+            )
             change = self.config.matched_loss * match.find(sight, picture, training=True)
-        return match.changed(colors, change, means, codes, centre)
+            elevation = sine_of_elevation(sky, centre)
+        return match.changed(colors, change, codes, elevation)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -301,17 +331,18 @@ class WildGS(Method):
         self, embeddings: Embeddings, means: Float[Tensor, "V 3"], intrinsic: Float[Tensor, "V I"]
     ) -> Float[Tensor, "V K 3"]:
         """Spherical harmonics by the fusion network and the colour match."""
-        if self._lacks("intrinsic"):
-            intrinsic = torch.zeros_like(intrinsic)
-        common, local, change = (
-            embeddings.global_embedding,
-            embeddings.local_embeddings,
-            embeddings.color_map,
-        )
+        common, local = embeddings.global_embedding, embeddings.local_embeddings
+        change, sky = embeddings.color_map, self.photo_match.sky(means, self._centre)
+        which = None if sky is None else sky.which
+        network_input = self._network_input(intrinsic)
         if change is None or change.shape[1] == 4:
-            return self.fusion(common, local, intrinsic, change)
-        harmonics = self.fusion(common, local, intrinsic)
+            return self.fusion.with_sky(common, local, network_input, which, change)
+        harmonics = self.fusion.with_sky(common, local, network_input, which)
         return self.photo_match.harmonics(harmonics, change, means, intrinsic, self._centre)
+
+    def _network_input(self, intrinsic: Float[Tensor, "V I"]) -> Float[Tensor, "V I"]:
+        """f^in, or zeros in the ablation without it."""
+        return torch.zeros_like(intrinsic) if self._lacks("intrinsic") else intrinsic
 
     def training_pass(
         self,
@@ -334,14 +365,28 @@ class WildGS(Method):
         if stage.explicit and self._wraps:
             lifted = self._lifted_in_training(photo, keep)
             appearance = self.wrap(photo, appearance, projection, lifted, learn=stage.learn_planes)
-        rows = rows_to_shade(projection.visible)
+        rows, landmark = self._rows_to_shade(projection.visible)
         # Taken once: every further gather of a row has a scatter in the backward pass.
         means, intrinsic = (take_rows(self.gaussians.rows[name], rows) for name in ("means", "intrinsic"))
-        harmonics = self._fused(self._embedded(appearance, means), means, intrinsic)
+        regions = intrinsic.split([landmark, len(rows) - landmark])
+        embeddings = self._embedded(appearance, means)
+        harmonics = self.fusion.by_region(
+            embeddings.global_embedding,
+            embeddings.local_embeddings,
+            *(self._network_input(region) for region in regions),
+        )
         matched = bool(self.config.color_match and self.config.matched_loss)
         colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
         if matched:
             sight = Sight(photo, projection, appearance.visibility, keep)
-            colors = self._matched(colors, means, intrinsic, rows, sight).clamp_min(0)
+            colors = self._matched(colors, regions[0], means[landmark:], rows, sight).clamp_min(0)
         colors = spread_rows(colors, rows, self.num_gaussians)
         return TrainingOutput(blend(projection, colors), projection, appearance.visibility, colors)
+
+    def _rows_to_shade(self, visible: Bool[Tensor, " N"]) -> tuple[Int[Tensor, " V"], int]:
+        """Rows of the landmark's visible Gaussians followed by those of the sky, and the number of the former."""
+        sky = self.sky()
+        if sky is None:
+            rows = rows_to_shade(visible)
+            return rows, len(rows)
+        return rows_by_group(visible, sky)
