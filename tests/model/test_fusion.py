@@ -82,3 +82,33 @@ def test_an_embedding_that_all_share_counts_as_one_for_each() -> None:
         results.append((sh.detach(), shared.grad, fusion.first_rows.weight.grad.clone()))
     for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_regions_in_order_have_the_harmonics_of_gaussians_in_any_order(apart: bool) -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(), 16, 16)
+    if apart:
+        fusion.separate_sky()
+    common, local = torch.randn(32 if apart else 16), torch.randn(16).expand(40, -1)
+    intrinsic, which = fusion.initial_intrinsic(torch.rand(40, 3)), torch.rand(40) < 0.3
+    unordered = fusion.with_sky(common, local, intrinsic, which)
+    ordered = fusion.by_region(common, local, intrinsic[~which], intrinsic[which])
+    torch.testing.assert_close(ordered, torch.cat([unordered[~which], unordered[which]]))
+
+
+def test_landmark_and_sky_follow_embeddings_of_their_own() -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(), 16, 16)
+    fusion.separate_sky()
+    local, intrinsic = torch.randn(16).expand(40, -1), fusion.initial_intrinsic(torch.rand(40, 3))
+    landmark, sky = torch.randn(2, 16), torch.randn(2, 16)
+    which = torch.arange(40) >= 30
+    shown = [
+        fusion.with_sky(torch.cat([a, b]), local, intrinsic, which)
+        for a, b in ((landmark[0], sky[0]), (landmark[1], sky[0]), (landmark[0], sky[1]))
+    ]
+    assert torch.equal(shown[0][which], shown[1][which])
+    assert torch.equal(shown[0][~which], shown[2][~which])
+    assert not torch.equal(shown[0][~which], shown[1][~which])
+    assert not torch.equal(shown[0][which], shown[2][which])
