@@ -85,6 +85,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
         assert model.pop(name) > 0
     assert model.pop("local_embeddings") is False
     assert model["sky"].pop("densify") is False
+    assert model["sky"].pop("own_fusion") is True
     assert train["optimizer"].pop("short_runs") > 0
     assert train["objective"].pop("mask_weight_photos") > 0
     assert train["objective"].pop("mask_power") > 1
@@ -94,6 +95,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert config.model.eps2d == 0.3  # with which its Gaussians were trained
     assert config.model.local_embeddings
     assert config.model.sky.densify
+    assert not config.model.sky.own_fusion
     assert config.train.optimizer.short_runs == 0
     assert (config.train.objective.mask_weight_photos, config.train.objective.mask_power) == (0, 1)
     assert config.train.density.min_visibility == 0.5

@@ -18,12 +18,14 @@ def test_default_changes_nothing() -> None:
 
 MENDED = {
     "model.parsing.encoder": "microsoft/resnet-18",
+    "model.parsing.max_side": 256,
     "model.local_embeddings": True,
     "model.wrapping.resolution": 128,
     "model.parsing.decoder_widths": [128, 64, 32],
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,
     "model.fusion.sh_degree": 3,
+    "model.fusion.hidden": 64,
     "model.depth_points.points": 0,
     "model.wrapping.partial_lifts": 0.0,
     "model.ground.points": 0,

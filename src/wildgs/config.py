@@ -225,6 +225,7 @@ _EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "local_embeddings"): ("wrapping", True),
     ("model", "eps2d"): ("wrapping", 0.3),
     ("model", "sky", "densify"): ("lowest", True),
+    ("model", "sky", "own_fusion"): ("lowest", False),
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
     ("train", "objective", "mask_weight_photos"): ("mask_weight_end", 0),
     ("train", "objective", "mask_power"): ("mask_weight_end", 1.0),

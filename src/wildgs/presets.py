@@ -28,12 +28,14 @@ class Preset:
 
 _PAPER: dict[str, Any] = {
     "model.parsing.encoder": RESNET18,
+    "model.parsing.max_side": 256,
     "model.local_embeddings": True,
     "model.wrapping.resolution": 128,
     "model.parsing.decoder_widths": [128, 64, 32],
     "model.parsing.color_statistics": False,
     "model.fusion.color_transform": False,
     "model.fusion.sh_degree": 3,
+    "model.fusion.hidden": 64,
     "model.depth_points.points": 0,
     "model.wrapping.partial_lifts": 0.0,
     "model.ground.points": 0,
@@ -71,7 +73,7 @@ PRESETS: dict[PresetName, Preset] = {
     "default": Preset(),
     "paper": Preset(_PAPER | _PRINTED),
     "paper-mended": Preset(_PAPER),
-    "fast": Preset({"model.parsing.max_side": 192}, steps=0.5),
+    "fast": Preset(steps=0.5),
 }
 """Measurements: docs/study.md. Values that the paper leaves open: docs/decisions.md."""
 

@@ -10,9 +10,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.model.encoder import load_encoder
 from wildgs.model.initial import sky_rows
 from wildgs.model.parsing import ParsingConfig
-from wildgs.model.registry import restore_method
 from wildgs.model.sky import SkyConfig, shell_directions
-from wildgs.model.triplane import Box
 from wildgs.model.wildgs import WildGS, WildGSConfig
 from wildgs.model.wrapping import WrappingConfig
 
@@ -113,19 +111,3 @@ def test_the_sky_does_not_grow_unless_configured(tower: tuple[WildGS, Camera]) -
     assert torch.equal(growable, torch.arange(len(growable)) < 1800)
     model.config = replace(model.config, sky=replace(model.config.sky, densify=True))
     assert model.growable() is None
-
-
-def test_a_run_from_before_the_sky_had_a_network_renders_as_it_did(tower: tuple[WildGS, Camera]) -> None:
-    """Its configuration does not say that the sky shares the landmark's network; its tensors do."""
-    model, camera = tower
-    shared = replace(model.config, sky=replace(model.config.sky, own_fusion=False))
-    old = WildGS(shared, model.gaussians, Box(torch.zeros(3), torch.ones(3)), model.parsing.encoder)
-    photo = torch.rand(camera.height, camera.width, 3)
-    restored = restore_method("wildgs", model.config, old.state_dict())
-    assert isinstance(restored, WildGS)
-    assert restored.global_size == old.global_size == model.global_size // 2
-    with torch.no_grad():
-        pictures = [
-            each.render(camera, each.shade(each.encode(photo, camera))).colors for each in (old, restored)
-        ]
-    assert torch.equal(*pictures)

@@ -47,7 +47,7 @@ class ParsingConfig:
     """
 
     encoder: str = SQUEEZENET
-    max_side: int = 256
+    max_side: int = 192
     color_statistics: bool = True
     global_size: int = 16
     decoder_widths: tuple[int, int, int] = (64, 32, 16)
@@ -103,7 +103,7 @@ class FusionConfig:
     """
 
     intrinsic_size: int = 32
-    hidden: int = 64
+    hidden: int = 48
     sh_degree: int = 1
     output_scale: float = 0.1
     color_transform: bool = True

@@ -105,11 +105,9 @@ class WildGS(Method):
     @classmethod
     def blank(cls, config: WildGSConfig, gaussians: Gaussians, state: Mapping[str, Tensor]) -> WildGS:
         """Creates the method with an untrained encoder and an arbitrary box."""
-        if not any(name.startswith("fusion.sky.") for name in state):  # checkpoint of an earlier version
-            config = replace(config, sky=replace(config.sky, own_fusion=False))
         box = Box(torch.zeros(3), torch.ones(3))
         model = cls(config, gaussians, box, encoder_of(state, "parsing.encoder."))
-        if "photo_match.codes.weight" not in state:  # likewise
+        if "photo_match.codes.weight" not in state:  # checkpoint of an earlier version
             model.photo_match.codes = None
         model.light_basis.components = state.get("light_basis.components")
         return model
