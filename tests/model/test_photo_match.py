@@ -27,7 +27,7 @@ def test_a_training_render_comes_near_the_exposure_of_its_photo(
     for value in (0.2, 0.8):
         means = []
         for matched in (0.0, share):
-            model.config = replace(model.config, matched_loss=matched)
+            model.config = model.photo_match.config = replace(model.config, matched_loss=matched)
             rendering = model.training_pass(grey_photo(camera, value), camera, Stage()).rendering
             means.append(float(rendering.colors.detach()[8:-8, 8:-8].mean()))
         assert means[1] == pytest.approx(means[0] + share * (value - means[0]), abs=0.02)

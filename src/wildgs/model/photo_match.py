@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -22,8 +22,8 @@ from wildgs.model.color_match import (
     split_change,
 )
 from wildgs.model.config import WildGSConfig
-from wildgs.model.gaussians import Gaussians
-from wildgs.model.sky import Sky, find_sky
+from wildgs.model.gaussians import Gaussians, spread_rows
+from wildgs.model.sky import Sky, find_sky, sine_of_elevation
 from wildgs.rasterize import Projection, Rendering, blend, blend_sample
 
 MATCH_TILES, MATCH_EVERY = 40, 3
@@ -114,6 +114,13 @@ class PhotoMatch(nn.Module):
         """Light codes of the Gaussians, by which their transforms vary."""
         return intrinsic[:, :0] if self.codes is None else self.codes(intrinsic)
 
+    def landmark_codes(
+        self, intrinsic: Float[Tensor, "N I"], sky: Bool[Tensor, " N"] | None
+    ) -> Float[Tensor, "N L"]:
+        """Light codes of all Gaussians, 0 for the sky, whose transform has none."""
+        codes = self.light_codes(intrinsic)
+        return codes if sky is None else torch.where(sky[:, None], 0, codes)
+
     def sky(self, points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]) -> Sky | None:
         """Which points of a scene with this centre are sky; None for a scene without sky."""
         return find_sky(self.config.sky, points.detach(), centre)
@@ -162,6 +169,36 @@ class PhotoMatch(nn.Module):
             codes=picture.codes,
             training=training,
         )
+
+    def matched(
+        self,
+        colors: Float[Tensor, "V 3"],
+        landmark: Float[Tensor, "A I"],
+        sky: Float[Tensor, "B 3"],
+        rows: Int[Tensor, " V"],
+        count: int,
+        sight: Sight,
+        centre: Float[Tensor, " 3"],
+    ) -> Float[Tensor, "V 3"]:
+        """Matches colours of Gaussians to a photo in training, as far as `matched_loss` says.
+
+        Args:
+            colors: Colours of the landmark's Gaussians, followed by those of the sky.
+            landmark: Intrinsic features of the landmark's Gaussians.
+            sky: Centres of the sky's Gaussians.
+            rows: Indices of the Gaussians.
+            count: Number of all Gaussians.
+            sight: The photo.
+            centre: Centre of the scene.
+        """
+        codes = self.light_codes(landmark)
+        with torch.no_grad():
+            values = torch.cat([colors, functional.pad(codes, (0, 0, 0, len(sky)))], dim=1)
+            values = spread_rows(values, rows, count)
+            picture = self.picture(sight.projection, values, centre, training=True)
+            change = self.config.matched_loss * self.find(sight, picture, training=True)
+            elevation = sine_of_elevation(sky, centre)
+        return self.changed(colors, change, codes, elevation)
 
     def changed(
         self,

@@ -9,7 +9,6 @@ from typing import ClassVar
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
@@ -30,7 +29,6 @@ from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
 from wildgs.model.photo_match import PhotoMatch, Sight
-from wildgs.model.sky import sine_of_elevation
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
@@ -204,44 +202,11 @@ class WildGS(Method):
         sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
         with torch.no_grad():
             colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
-            codes = self._light_codes()
+            codes = self.photo_match.landmark_codes(self.gaussians.rows["intrinsic"], self.sky())
             values = torch.cat([colors, codes], dim=1)
             picture = self.photo_match.picture(sight.projection, values, self._centre)
             change = self.photo_match.find(sight, picture)
         return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
-
-    def _light_codes(self) -> Float[Tensor, "N L"]:
-        """Light codes of all Gaussians; those of the sky are 0, because its transform has none."""
-        codes, sky = self.photo_match.light_codes(self.gaussians.rows["intrinsic"]), self.sky()
-        return codes if sky is None else torch.where(sky[:, None], 0, codes)
-
-    def _matched(
-        self,
-        colors: Float[Tensor, "V 3"],
-        landmark: Float[Tensor, "L I"],
-        sky: Float[Tensor, "S 3"],
-        rows: Int[Tensor, " V"],
-        sight: Sight,
-    ) -> Float[Tensor, "V 3"]:
-        """Applies the colour match, scaled by `matched_loss`, to colours of Gaussians in training.
-
-        Args:
-            colors: Colours of the landmark's Gaussians, followed by those of the sky.
-            landmark: Intrinsic features of the landmark's Gaussians.
-            sky: Centres of the sky's Gaussians.
-            rows: Indices of the Gaussians.
-            sight: The photo.
-        """
-        match, centre = self.photo_match, self._centre
-        codes = match.light_codes(landmark)
-        with torch.no_grad():
-            values = torch.cat([colors, functional.pad(codes, (0, 0, 0, len(sky)))], dim=1)
-            picture = match.picture(
-                sight.projection, spread_rows(values, rows, self.num_gaussians), centre, training=True
-            )
-            change = self.config.matched_loss * match.find(sight, picture, training=True)
-            elevation = sine_of_elevation(sky, centre)
-        return match.changed(colors, change, codes, elevation)
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -377,7 +342,9 @@ class WildGS(Method):
         colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
         if matched:
             sight = Sight(photo, projection, appearance.visibility, keep)
-            colors = self._matched(colors, regions[0], means[landmark:], rows, sight).clamp_min(0)
+            colors = self.photo_match.matched(
+                colors, regions[0], means[landmark:], rows, self.num_gaussians, sight, self._centre
+            ).clamp_min(0)
         colors = spread_rows(colors, rows, self.num_gaussians)
         return TrainingOutput(blend(projection, colors), projection, appearance.visibility, colors)
 
