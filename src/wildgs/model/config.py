@@ -134,8 +134,8 @@ class SkyConfig:
         opacity: Initial opacity of the sky Gaussians.
         densify: Densify sky Gaussians as well. Clouds differ between photos and can then take up to half of all
             Gaussians.
-        own_fusion: Predict the colours of sky Gaussians by a fusion network of their own, from a global embedding
-            of their own, because clouds and haze follow other rules than the light on surfaces.
+        own_fusion: Predict the colours of sky Gaussians by a fusion network of their own, because clouds and haze
+            follow other rules than the light on surfaces.
     """
 
     points: int = 5000

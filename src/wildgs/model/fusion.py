@@ -46,7 +46,7 @@ class Fusion(MixedModule):
         """Network of the sky's Gaussians, which have no local embeddings; None: they share this one."""
 
     def separate_sky(self) -> None:
-        """Gives the sky's Gaussians a network and a global embedding of their own. Not in the paper."""
+        """Gives the sky's Gaussians a network of their own. Not in the paper."""
         self.sky = Fusion(self.config, self.first_global.in_features, local_size=0)
 
     def initial_intrinsic(self, colors: Float[Tensor, "P 3"]) -> Float[Tensor, "P I"]:
@@ -105,17 +105,16 @@ class Fusion(MixedModule):
         """SH coefficients of the landmark's Gaussians, followed by those of the sky.
 
         Args:
-            global_embedding: Emb^g; with a network of the sky, that of the landmark followed by that of the sky.
+            global_embedding: Emb^g.
             local_embeddings: Emb^l of all Gaussians in this order.
             landmark: f^in of the landmark's Gaussians.
             sky: f^in of the sky's Gaussians.
         """
         if self.sky is None:
             return self(global_embedding, local_embeddings, torch.cat([landmark, sky]))
-        common, of_sky = global_embedding.chunk(2)
-        parts = [self(common, local_embeddings[: len(landmark)], landmark)]
+        parts = [self(global_embedding, local_embeddings[: len(landmark)], landmark)]
         if len(sky):
-            parts.append(self.sky(of_sky, _no_local(sky), sky))
+            parts.append(self.sky(global_embedding, _no_local(sky), sky))
         return torch.cat(parts)
 
     def with_sky(
@@ -129,21 +128,18 @@ class Fusion(MixedModule):
         """Like `by_region` for Gaussians in any order.
 
         Args:
-            global_embedding: As in `by_region`.
+            global_embedding: Emb^g.
             local_embeddings: Emb^l.
             intrinsic: f^in.
             which: Sky Gaussians; None if there are none.
             color_map: As in `forward`.
         """
-        if self.sky is None:
-            return self(global_embedding, local_embeddings, intrinsic, color_map)
-        common, of_sky = global_embedding.chunk(2)
-        harmonics = self(common, local_embeddings, intrinsic, color_map)
-        if which is None:
+        harmonics = self(global_embedding, local_embeddings, intrinsic, color_map)
+        if self.sky is None or which is None:
             return harmonics
         rows = which.nonzero()[:, 0]
         above = intrinsic[rows]
-        return harmonics.index_copy(0, rows, self.sky(of_sky, _no_local(above), above, color_map))
+        return harmonics.index_copy(0, rows, self.sky(global_embedding, _no_local(above), above, color_map))
 
     def _first_layer(
         self,

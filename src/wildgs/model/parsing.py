@@ -103,14 +103,8 @@ class Parsing(MixedModule):
     opponents: Tensor
     feature_cache: FeatureCache | None = None
 
-    def __init__(self, config: ParsingConfig, encoder: Encoder | None = None, embeddings: int = 1) -> None:
-        """Creates the network.
-
-        Args:
-            config: Configuration.
-            encoder: Replaces the configured encoder.
-            embeddings: Number of global embeddings that are predicted, concatenated.
-        """
+    def __init__(self, config: ParsingConfig, encoder: Encoder | None = None) -> None:
+        """Creates the network; `encoder` replaces the configured one."""
         super().__init__()
         self.config = config
         self.encoder = encoder or load_encoder(config.encoder)
@@ -118,7 +112,7 @@ class Parsing(MixedModule):
         deep = self.encoder.widths[-1]
         summary = deep + (STATISTICS if config.color_statistics else 0)
         self.global_mlp = nn.Sequential(
-            nn.Linear(summary, 64), nn.LeakyReLU(0.1), nn.Linear(64, embeddings * config.global_size)
+            nn.Linear(summary, 64), nn.LeakyReLU(0.1), nn.Linear(64, config.global_size)
         )
         widths = (deep, *config.decoder_widths)
         self.decoder = nn.ModuleList(

@@ -62,15 +62,14 @@ class WildGS(Method):
         self.gaussians = gaussians
         gaussians.eps2d = config.eps2d
         self.sh_degree = config.fusion.sh_degree
-        sky_apart = bool(config.sky.points and config.sky.own_fusion)
-        self.global_size = (1 + sky_apart) * config.parsing.global_size
+        self.global_size = config.parsing.global_size
         self.local_size = config.wrapping.local_size
         self.mask_threshold = config.mask_threshold
         self.depth_supervised = not self._lacks("depth")
-        self.parsing = Parsing(config.parsing, encoder, embeddings=1 + sky_apart)
+        self.parsing = Parsing(config.parsing, encoder)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
-        if sky_apart:
+        if config.sky.points and config.sky.own_fusion:
             self.fusion.separate_sky()
         self.light_basis = LightBasis()
         self.photo_match = PhotoMatch(config)
