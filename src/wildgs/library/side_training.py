@@ -10,12 +10,11 @@ import contextlib
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from wildgs.config import ExecutionConfig, RunConfig, write_config
-from wildgs.engine.trainer import Observer
 from wildgs.runs import default_device
 from wildgs.threads import kernels_limited, limited, thread_count
 
@@ -26,7 +25,7 @@ SECONDS_TO_SAVE = 20.0
 @contextmanager
 def training_beside(
     config: RunConfig, folder: Path, execution: ExecutionConfig
-) -> Iterator[tuple[Observer, subprocess.Popen[bytes] | None]]:
+) -> Iterator[tuple[Callable[[object], None], subprocess.Popen[bytes] | None]]:
     """Trains a run in another process during the block, on a quarter of the threads and at least one.
 
     It is an optimisation only: the caller continues or repeats the training afterwards, which finds a finished run
