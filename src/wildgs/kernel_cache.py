@@ -30,7 +30,8 @@ _SHARED = ("threads.py", "kernel_cache.py")
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit(**options)` with this module's cache."""
+    """`numba.njit(**options)` with this module's cache, without the wrappers that only C code would call."""
+    options = {"no_cfunc_wrapper": True} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel: Any = numba.njit(**options)(function)
