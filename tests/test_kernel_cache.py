@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,22 @@ def test_an_edit_of_a_file_that_a_kernel_calls_is_noticed(tmp_path: Path):
     assert run(tmp_path) == [42, 1]
     (package / "shared.py").write_text(SHARED.format(factor=3))
     assert run(tmp_path) == [63, 0], "old code ran"
+
+
+def test_of_two_processes_that_start_at_once_one_compiles(tmp_path: Path):
+    package = tmp_path / "kernels"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    waiting = "import time\nwhile time.time() < {start}:\n    pass\n"
+    body = KERNEL.format(package="kernels").replace(
+        "print(", waiting.format(start="float(sys.argv[1])") + "print(", 1
+    )
+    (package / "kernel.py").write_text(body)
+    (package / "shared.py").write_text(SHARED.format(factor=2))
+    command = [sys.executable, "-W", "error", "-c", "import kernels.kernel", str(time.time() + 6)]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) for _ in range(2)]
+    found = sorted(process.communicate(timeout=120)[0].split() for process in both)
+    assert found == [["42", "0"], ["42", "1"]]
 
 
 def test_where_nothing_is_writable_a_temporary_folder_serves_with_one_warning(

@@ -1,7 +1,8 @@
 """Numba's `njit` with a disk cache whose key is a digest of all source files that a kernel may be compiled from.
 
 Numba's own cache only checks the kernel's own file, so that outdated code would run after a change in another file
-whose functions the kernel calls. It also fails if neither the package nor the home folder is writable.
+whose functions the kernel calls. It also fails if neither the package nor the home folder is writable, and several
+processes that start at once would all compile every kernel.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numba
 from numba.core import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
@@ -28,7 +30,8 @@ _SHARED = ("threads.py", "kernel_cache.py")
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit(**options)` with this module's cache."""
+    """`numba.njit(**options)` with this module's cache, without the wrappers that only C code would call."""
+    options = {"no_cfunc_wrapper": True} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel: Any = numba.njit(**options)(function)
@@ -127,5 +130,43 @@ class _Implementation(CompileResultCacheImpl):
     _locator_classes = [_Locator]  # noqa: RUF012 - Numba's name
 
 
+LONGEST_COMPILATION = 120.0
+"""Seconds after which a process no longer waits for another one that compiles the same kernel."""
+
+
 class _KernelCache(FunctionCache):
+    """Lets one process compile a kernel while others that need it wait, and then load it."""
+
     _impl_class = _Implementation
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        name = f"{function.__qualname__}-{function.__code__.co_firstlineno}.lock"
+        file = Path(self.cache_path) / "locks" / name.replace("<locals>", "")
+        self._lock = filelock.FileLock(file, timeout=LONGEST_COMPILATION)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel; if it is not on the disk, the lock is held until `save_overload`."""
+        found = super().load_overload(sig, target_context)
+        if found is not None or not self._begin():
+            return found
+        found = super().load_overload(sig, target_context)
+        if found is not None:  # compiled by another process meanwhile
+            self._lock.release()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Writes a compiled kernel and releases the lock."""
+        try:
+            super().save_overload(sig, data)
+        finally:
+            self._lock.release(force=True)
+
+    def _begin(self) -> bool:
+        """Locks the kernel; False on a file system without locks, or if another process takes too long."""
+        try:
+            Path(self._lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+        except (OSError, NotImplementedError):  # `filelock.Timeout` is an OSError
+            return False
+        return True

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,6 +35,38 @@ def library_environment() -> Iterator[None]:
     finally:
         for name in added:
             os.environ.pop(name, None)
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
+_MMAP_BYTES, _KEPT_BYTES = 2**25, 2**30  # 32 MiB is glibc's maximum of the first
+_DEFAULT_BYTES = 128 * 2**10
+
+_keeping: list[None] = []
+"""One entry for each active block of `freed_memory_kept`, which may overlap."""
+
+
+@contextmanager
+def freed_memory_kept() -> Iterator[None]:
+    """Makes glibc's malloc keep freed memory for the duration of the block; blocks may be nested or overlap.
+
+    Returning large arrays to the operating system costs a page fault per 4 KiB at their next allocation.
+    """
+    _keeping.append(None)
+    if len(_keeping) == 1:
+        _set_malloc(_MMAP_BYTES, _KEPT_BYTES)
+    try:
+        yield
+    finally:
+        _keeping.pop()
+        if not _keeping:
+            _set_malloc(_DEFAULT_BYTES, _DEFAULT_BYTES)
+
+
+def _set_malloc(mmap_bytes: int, trim_bytes: int) -> None:
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, mmap_bytes)
+        mallopt(_M_TRIM_THRESHOLD, trim_bytes)
 
 
 ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))

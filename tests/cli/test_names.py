@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from wildgs.library.loaded import LoadedScene
 from wildgs.library.pages import write_showcase
 from wildgs.runs import load_run
 
@@ -32,7 +33,7 @@ def test_names_of_any_bytes_go_from_training_to_the_report(
     scene = loaded.read_scene()
     assert {view.name for view in scene.views} == set(NAMES)
     page = tmp_path / "report.html"
-    write_showcase(page, folder.name, f"{folder}", scene, [("3dgs", loaded, {})])
+    write_showcase(page, folder.name, f"{folder}", scene, [("3dgs", LoadedScene(loaded), {})])
     html = page.read_text(encoding="utf-8")
     assert r"sc\xe8ne" in html
     assert "<img src=x>" not in html

@@ -23,6 +23,7 @@ from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day
 from wildgs.light.day import plan_day
 from wildgs.light.shadows import SIDE, SunFinder
 from wildgs.model.appearance import Appearance
+from wildgs.scene import View
 from wildgs.scene.capture import Capture, carry_capture
 
 
@@ -168,16 +169,17 @@ def test_a_day_keeps_small_masks(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert small.mean() == pytest.approx(0.5, abs=0.01)
     assert day_module._small(torch.ones(6, 8)).shape == (6, 8)
 
-    scene, encode, kept = wildgs.load(run), day_module.encode_view, []
+    scene, kept = wildgs.load(run), []
+    encode = scene.encode
 
-    def with_large_mask(*given: object) -> Appearance:
-        return replace(encode(*given), visibility=large)
+    def with_large_mask(view: View) -> Appearance:
+        return replace(encode(view), visibility=large)
 
     def keep(self: SunFinder, photo: object, camera: object, masks: tuple) -> torch.Tensor:
         kept.append(masks[1])
         return torch.zeros(3)
 
-    monkeypatch.setattr(day_module, "encode_view", with_large_mask)
+    monkeypatch.setattr(scene, "encode", with_large_mask)
     monkeypatch.setattr(SunFinder, "direction", keep)
     (run / DAY_FILE).unlink(missing_ok=True)
     find_day(scene)

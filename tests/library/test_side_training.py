@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.config import TrainConfig
@@ -27,6 +28,7 @@ def test_the_other_process_finishes_its_run(config: RunConfig, tmp_path: Path) -
         assert process.wait(120) == 0
         observe(object())
         assert thread_count() == 2
+        assert torch.get_num_threads() == 1, "torch's threads hardly help, and wait for each other"
     assert load_run(tmp_path / "run").step == 3
 
 

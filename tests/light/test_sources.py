@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.light import photos
 from wildgs.light import sources as module
 from wildgs.light.look import NEUTRAL
 from wildgs.light.photos import cover, encode_picture, encode_view
@@ -55,7 +56,7 @@ def test_a_photo_by_name_with_or_without_ending(sources, method, wall) -> None:
 
 def test_a_look_is_kept(sources, monkeypatch) -> None:
     first = sources.find("0.jpg")
-    monkeypatch.setattr(module, "encode_view", lambda *_: pytest.fail("encoded again"))
+    monkeypatch.setattr(photos, "encode_view", lambda *_: pytest.fail("encoded again"))
     assert sources.find("0.jpg") is first
 
 

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from contextlib import ExitStack
 
 import torch
 from torch import Tensor
 
-from wildgs.processes import library_environment
-
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
-_MMAP_BYTES, _KEPT_BYTES = 2**25, 2**30  # 32 MiB is glibc's maximum of the first
-_DEFAULT_BYTES = 128 * 2**10
+from wildgs.processes import freed_memory_kept, library_environment
 
 
 class ProcessSettings:
@@ -39,8 +33,7 @@ class ProcessSettings:
             # Adam's moments of parameters without gradients decay into denormals, which are up to 100 times slower.
             undo.callback(torch.set_flush_denormal, _flushes_denormals())
             torch.set_flush_denormal(True)
-            _keep_freed_memory(True)
-            undo.callback(_keep_freed_memory, False)
+            undo.enter_context(freed_memory_kept())
         self._undo = undo
 
     def end(self) -> None:
@@ -76,13 +69,3 @@ def _set_random_states(device: torch.device, states: dict[str, Tensor]) -> None:
 
 def _flushes_denormals() -> bool:
     return float(torch.full((1,), 1e-40).mul(1.0)) == 0
-
-
-def _keep_freed_memory(keep: bool) -> None:
-    """Makes glibc's malloc keep freed memory: returning it costs a page fault per 4 KiB in every step."""
-    if sys.platform != "linux":
-        return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _MMAP_BYTES if keep else _DEFAULT_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES if keep else _DEFAULT_BYTES)

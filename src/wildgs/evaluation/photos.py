@@ -24,9 +24,11 @@ from wildgs.errors import UserError
 from wildgs.evaluation.metrics import MAX_PSNR
 from wildgs.evaluation.pictures import write_json
 from wildgs.files import read_json
+from wildgs.model.appearance import Appearance
 from wildgs.model.method import Method
 from wildgs.rasterize import blend
 from wildgs.scene.scene import Scene, View, observed_pixels
+from wildgs.threads import infer_each
 
 PHOTOS_FILE = "photos.json"
 """File in the run folder with the results of `inspect_photos`."""
@@ -91,7 +93,10 @@ def inference(method: Method) -> Iterator[None]:
 
 
 def inspect_photos(
-    method: Method, scene: Scene, on_photo: Callable[[int, int], None] | None = None
+    method: Method,
+    scene: Scene,
+    on_photo: Callable[[int, int], None] | None = None,
+    on_appearance: Callable[[str, Appearance], None] | None = None,
 ) -> list[PhotoFit]:
     """Renders every training photo under its own appearance at low resolution, and measures its mask.
 
@@ -99,6 +104,7 @@ def inspect_photos(
         method: A trained method.
         scene: The scene on which it was trained.
         on_photo: Called with (photos inspected, total).
+        on_appearance: Called with the name and the appearance of each photo.
 
     Returns:
         One entry per readable training photo; none for a method without appearance.
@@ -106,18 +112,30 @@ def inspect_photos(
     if not method.relightable:
         return []
     observed, views, found = observed_pixels(scene), scene.train_views, []
+
+    def inspect(view: View) -> tuple[PhotoFit, Appearance] | None:
+        try:
+            return _inspect(method, view, observed.get(view.name))
+        except UserError:  # the photo was removed after training; the others are still inspected
+            return None
+
     with inference(method):
-        for count, view in enumerate(views, start=1):
-            try:
-                found.append(_inspect(method, view, observed.get(view.name)))
-            except UserError:  # the photo was removed after training; the others are still inspected
+        results = infer_each(inspect, views, method.gaussians.means.device)
+        for count, (view, result) in enumerate(zip(views, results, strict=True), start=1):
+            if result is None:
                 continue
+            found.append(result[0])
+            if on_appearance is not None:
+                on_appearance(view.name, result[1])
             if on_photo is not None:
                 on_photo(count, len(views))
     return found
 
 
-def _inspect(method: Method, view: View, observed: Float[Tensor, "K 2"] | None) -> PhotoFit:
+def _inspect(
+    method: Method, view: View, observed: Float[Tensor, "K 2"] | None
+) -> tuple[PhotoFit, Appearance]:
+    """The fit of a photo, and its appearance."""
     device = method.gaussians.means.device
     photo, keep = view.load(device)
     appearance = method.encode(photo, view.camera.to(device), keep, name=view.name)
@@ -142,7 +160,7 @@ def _inspect(method: Method, view: View, observed: Float[Tensor, "K 2"] | None) 
         mean = (error * weights).sum() / weights.sum()
         psnr = min(float(-10 * mean.log10()), MAX_PSNR)
         structure = _structure(small[:3].mean(dim=0), colors.nan_to_num().mean(dim=2), weights)
-    return PhotoFit(view.name, psnr, structure, hidden, static_hidden, count)
+    return PhotoFit(view.name, psnr, structure, hidden, static_hidden, count), appearance
 
 
 def _structure(

@@ -30,6 +30,7 @@ from wildgs.evaluation.photos import PhotoFit, inference, summarize_photos
 from wildgs.evaluation.pictures import picture_paths, write_json, write_picture
 from wildgs.model.method import Method
 from wildgs.scene.scene import Scene, View, observed_pixels
+from wildgs.threads import infer_each
 
 Protocol = Literal["full", "half"]
 _TIMED_FRAMES = 15
@@ -66,9 +67,8 @@ class _Notes:
 
     lines: list[str] = field(default_factory=list)
 
-    def add(self, line: str) -> None:
-        if line not in self.lines:
-            self.lines.append(line)
+    def add(self, *lines: str) -> None:
+        self.lines += [line for line in dict.fromkeys(lines) if line not in self.lines]
 
 
 def evaluate(
@@ -125,14 +125,23 @@ def evaluate(
     paths = picture_paths(view.name for view in scene.test_views)
     observed = observed_pixels(scene, least_photos=1, split="test")
     scores: list[ImageScore] = []
+
+    def score(view: View) -> tuple[ImageScore, _Notes, Tensor | None]:
+        own, sh = _Notes(), _shade(method, view, protocol, device)
+        render = _render(method, view, sh, own)
+        write_picture(folder / paths[view.name], render)
+        found = _score_view(view, render, protocol, observed, lpips, own)
+        return found, own, sh if view is scene.test_views[-1] else None
+
     with inference(method):
-        for view in scene.test_views:
-            sh = _shade(method, view, protocol, device)
-            render = _render(method, view, sh, notes)
-            write_picture(folder / paths[view.name], render)
-            scores.append(_score_view(view, render, protocol, observed, lpips, notes))
+        sh = None
+        for found, own, last in infer_each(score, scene.test_views, device):
+            sh = last
+            scores.append(found)
+            notes.add(*own.lines)
             if on_view is not None:
-                on_view(view.name)
+                on_view(found.name)
+        assert sh is not None
         fps = _measure_fps(method, sh, scene.test_views, device)
         masks = _score_masks(method, scene, device, mask_threshold) if protocol == "full" else None
     content: dict[str, Any] = {
@@ -276,11 +285,15 @@ def _synchronize(device: torch.device) -> None:
 def _score_masks(method: Method, scene: Scene, device: torch.device, threshold: float) -> MaskScore | None:
     """Scores of the masks of training photos; None without ground truth or predicted masks."""
     score = MaskScore(threshold)
-    for view in scene.train_views:
+
+    def compare(view: View) -> tuple[Tensor | None, Tensor] | None:
         truth = view.read_truth_mask()
-        if truth is None:
+        return None if truth is None else (method.visibility(view.load(device)[0]), truth)
+
+    for compared in infer_each(compare, scene.train_views, device):
+        if compared is None:
             continue
-        visibility = method.visibility(view.load(device)[0])
+        visibility, truth = compared
         if visibility is None:
             return None
         score.add(visibility, truth > 127)

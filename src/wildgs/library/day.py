@@ -24,7 +24,7 @@ from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
 from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, visible_rows
 from wildgs.light.look import Timeline
-from wildgs.light.photos import MAX_PHOTOS, encode_view
+from wildgs.light.photos import MAX_PHOTOS
 from wildgs.light.shadows import SIDE, SunFinder
 from wildgs.light.sun import phase_of
 from wildgs.progress import Progress, counter
@@ -32,6 +32,7 @@ from wildgs.scene import View
 from wildgs.scene.capture import Capture, read_capture
 from wildgs.scene.colmap import find_model
 from wildgs.scene.photo_store import with_ending
+from wildgs.threads import infer_each
 
 DAY_FILE = "day.json"
 """Caches the day in the run folder; valid for one checkpoint."""
@@ -114,23 +115,32 @@ def _lights(loaded: LoadedScene, views: list[View], progress: Progress | None) -
     method, show = loaded.run.method, counter(progress, "comparing the light of photos")
     rows = visible_rows(method, viewpoints_of(views))
     mean, patterns, masks = torch.zeros((), device=rows.device), {}, []
-    for number, view in enumerate(views, start=1):
-        appearance = encode_view(method, view)
-        sh = method.shade(appearance)
+
+    def describe(view: View) -> tuple[Tensor, Tensor | None]:
+        appearance = loaded.encode(view)
+        mask = appearance.visibility
+        return method.shade(appearance), None if mask is None else _small(mask)
+
+    found = infer_each(describe, views, rows.device)
+    for number, (view, (sh, mask)) in enumerate(zip(views, found, strict=True), start=1):
         mean = mean + sh / len(views)
         patterns[view.name] = pattern_of(sh[rows])
-        masks.append(None if appearance.visibility is None else _small(appearance.visibility))
+        masks.append(mask)
         show(number, len(views))
     return _Lights(patterns, masks, rows, mean)
 
 
 def _find_suns(loaded: LoadedScene, views: list[View], lights: _Lights) -> Float[np.ndarray, "P 3"]:
     method = loaded.run.method
-    finder, suns = SunFinder(method.gaussians, method.sky(), lights.rows, lights.mean), []
-    for view, mask in zip(views, lights.masks, strict=True):
+    finder = SunFinder(method.gaussians, method.sky(), lights.rows, lights.mean)
+
+    def find(seen: tuple[View, Tensor | None]) -> Tensor:
+        view, mask = seen
         photo, keep = view.load(lights.rows.device)
-        suns.append(finder.direction(photo, view.camera, (keep, mask)))
-    return torch.stack(suns).double().cpu().numpy()
+        return finder.direction(photo, view.camera, (keep, mask))
+
+    suns = infer_each(find, list(zip(views, lights.masks, strict=True)), lights.rows.device)
+    return torch.stack(list(suns)).double().cpu().numpy()
 
 
 def _digest(captures: dict[str, Capture]) -> str:

@@ -21,8 +21,10 @@ from wildgs.evaluation.photos import PhotoFit, find_misfits, inspect_photos, rea
 from wildgs.geometry.camera import Camera
 from wildgs.library.config import MixOptions
 from wildgs.light.look import NEUTRAL, Look, Timeline, mix, with_sky
+from wildgs.light.photos import KeptAppearances
 from wildgs.light.saved import save_look
 from wildgs.light.sources import LightSources
+from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
 from wildgs.progress import Progress, counter
 from wildgs.rasterize import blend
@@ -41,9 +43,17 @@ class LoadedScene:
         run: The run: its configuration, trained method and alignment.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, appearances: KeptAppearances | None = None) -> None:
+        """Wraps a run.
+
+        Args:
+            run: The run.
+            appearances: Appearances of its photos that are known already, such as those of the training.
+        """
         self.run = run
-        self._sources = LightSources(run.method, lambda: self.scene, run.folder / FEATURE_INDEX_FILE)
+        self._appearances = appearances or KeptAppearances()
+        index = run.folder / FEATURE_INDEX_FILE
+        self._sources = LightSources(run.method, lambda: self.scene, index, self._appearances)
 
     @property
     def scene(self) -> Scene:
@@ -84,6 +94,10 @@ class LoadedScene:
             UserError: The photo or file does not exist or cannot be used.
         """
         return spec if isinstance(spec, Look) else self._sources.find(spec, like=like, progress=progress)
+
+    def encode(self, view: View) -> Appearance:
+        """The appearance of a photo of the scene, computed once while memory allows."""
+        return self._appearances.of(self.run.method, view)
 
     @torch.no_grad()
     def render(self, camera: Camera, look: Look) -> UInt8[Tensor, "H W 3"]:
@@ -151,7 +165,8 @@ class LoadedScene:
         photos = read_photos(self.run.folder, self.run.step)
         if photos is None:
             show = counter(progress, "inspecting training photos")
-            photos = inspect_photos(self.run.method, scene or self.scene, show)
+            keep = self._appearances.keep
+            photos = inspect_photos(self.run.method, scene or self.scene, show, keep)
             write_photos(self.run.folder, self.run.step, photos)
         return photos
 

@@ -32,10 +32,10 @@ from wildgs.light.photos import encode_view
 from wildgs.model.gaussians import NEAR
 from wildgs.model.method import Method
 from wildgs.progress import Progress
-from wildgs.runs import Run
 from wildgs.scene import Scene, View, match_view
 from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.sfm.report import describe_placed, read_left_out
+from wildgs.threads import infer_each
 
 PAGE_LIGHTS = 6
 
@@ -95,9 +95,10 @@ def write_webpage(
     return ExportedFile(file, file.stat().st_size / 1e6, len(page.splats), degree, tuple(looks))
 
 
-def write_scene_page(run: Run, file: Path, title: str, progress: Progress | None = None) -> ExportedFile:
+def write_scene_page(
+    loaded: LoadedScene, file: Path, title: str, progress: Progress | None = None
+) -> ExportedFile:
     """Writes the web page of a run under automatically selected lights, for `wildgs run` and `wildgs demo`."""
-    loaded = LoadedScene(run)
     return write_webpage(loaded, page_looks(loaded, progress), file, title=title)
 
 
@@ -142,7 +143,7 @@ def write_showcase(
     title: str,
     summary: str,
     scene: Scene,
-    runs: Sequence[tuple[str, Run, Scores]],
+    runs: Sequence[tuple[str, LoadedScene, Scores]],
 ) -> None:
     """Writes the report on one or more runs on the same scene.
 
@@ -153,16 +154,17 @@ def write_showcase(
         scene: The scene of all runs.
         runs: Name, run and scores. Images show the first run, and the second as its baseline.
     """
-    shown = runs[0][1].method
-    baseline = runs[1][1].method if len(runs) > 1 else None
+    shown = runs[0][1]
+    baseline = runs[1][1].run.method if len(runs) > 1 else None
+    device = shown.gaussians.means.device
     views = scene.test_views or scene.train_views
     chosen = views[:: max(1, -(-len(views) // EXAMPLES))][:EXAMPLES]
-    fits = LoadedScene(runs[0][1]).photo_fits(scene=scene)
+    fits = shown.photo_fits(scene=scene)
     misfits = find_misfits(fits)
     lights = different_lights(_without(scene.train_views, misfits), LIGHTS + 1)
     with torch.no_grad():
-        shaded = [(light, shown.shade(encode_view(shown, light))) for light in lights]
-        examples = tuple(_example(view, shaded, shown, baseline) for view in chosen)
+        shaded = [(light, shown.run.method.shade(shown.encode(light))) for light in lights]
+    examples = tuple(infer_each(lambda view: _example(view, shaded, shown, baseline), chosen, device))
     methods = tuple(MethodScores.from_metrics(name, {**scores}) for name, _, scores in runs if scores)
     others = [fit for fit in fits if fit.hidden is not None and fit not in misfits]
     others.sort(key=lambda fit: (fit.static_hidden or 0.0, fit.hidden or 0.0), reverse=True)
@@ -171,8 +173,8 @@ def write_showcase(
         summary,
         methods,
         examples,
-        misfits=_beside_masks(shown, scene, misfits[:MISFITS]),
-        masks=_beside_masks(shown, scene, others[:MASKS]),
+        misfits=_beside_masks(shown.run.method, scene, misfits[:MISFITS]),
+        masks=_beside_masks(shown.run.method, scene, others[:MASKS]),
         poses=describe_placed(scene.root),
         unplaced=tuple(
             ReportUnplaced(photo.name, photo.reason, _matches(photo.picture))
@@ -190,14 +192,12 @@ def _matches(picture: Path | None) -> np.ndarray | None:
         return None
 
 
-@torch.no_grad()
 def _beside_masks(method: Method, scene: Scene, fits: Sequence[PhotoFit]) -> tuple[ReportMask, ...]:
     """Training photos with their masks, and captions with their measurements."""
     views = {view.name: view for view in scene.train_views}
-    device, found = method.gaussians.means.device, []
-    for fit in fits:
-        if fit.name not in views:
-            continue
+    device = method.gaussians.means.device
+
+    def show(fit: PhotoFit) -> ReportMask:
         visibility = method.visibility(views[fit.name].load(device)[0])
         mask = None if visibility is None else visibility.float().cpu().numpy()
         caption = [
@@ -208,8 +208,9 @@ def _beside_masks(method: Method, scene: Scene, fits: Sequence[PhotoFit]) -> tup
         if fit.hidden is not None:
             caption.append(f"{fit.hidden:.0%} of the photo hidden")
         photo = views[fit.name].read_photo().numpy()
-        found.append(ReportMask(fit.name, photo, mask, "; ".join(caption)))
-    return tuple(found)
+        return ReportMask(fit.name, photo, mask, "; ".join(caption))
+
+    return tuple(infer_each(show, [fit for fit in fits if fit.name in views], device))
 
 
 def _without(views: Sequence[View], misfits: Sequence[PhotoFit]) -> list[View]:
@@ -234,13 +235,13 @@ def _colour_of(view: View) -> Tensor:
 def _example(
     view: View,
     lights: Sequence[tuple[View, Float[Tensor, "N K 3"]]],
-    method: Method,
+    shown: LoadedScene,
     baseline: Method | None,
 ) -> ReportExample:
     """The images of a view, also under the lights of other photos (given as shaded harmonics)."""
-    device = method.gaussians.means.device
-    camera = view.camera.to(device)
-    appearance = encode_view(method, view)
+    method = shown.run.method
+    camera = view.camera.to(method.gaussians.means.device)
+    appearance = shown.encode(view)
     rendering = method.render(camera, method.shade(appearance))
     depth = torch.where(rendering.alpha > 0.5, rendering.depth, 0.0)
     visibility = appearance.visibility

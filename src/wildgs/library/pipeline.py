@@ -17,6 +17,7 @@ from wildgs.library.collection import (
     record_collection,
 )
 from wildgs.library.evaluation import Scores, evaluate
+from wildgs.library.loaded import LoadedScene
 from wildgs.library.logs import logger
 from wildgs.library.pages import write_scene_page, write_showcase
 from wildgs.library.side_training import training_beside
@@ -27,7 +28,7 @@ from wildgs.priors.config import StereoConfig
 from wildgs.priors.depth import DEPTH_ANYTHING, fill_depth_folder, load_depth_anything
 from wildgs.priors.stereo.depth import fill_metric_folder
 from wildgs.progress import Progress, counter, silent
-from wildgs.runs import Run, default_device, load_run, lock_run
+from wildgs.runs import default_device, load_run, lock_run
 from wildgs.scene import Scene
 from wildgs.scene.config import DataConfig
 from wildgs.scene.demo import write_demo_scene
@@ -103,7 +104,7 @@ def run(
         size = _photo_size(output, max_side, downscale)
         config = _configure(scene_folder, output / CONFIG_FILE, steps, size, max_gaussians, holdout)
         scene = read_scene(config, execution or ExecutionConfig(), progress)
-        train(
+        trained = train(
             scene,
             config,
             output=output,
@@ -113,11 +114,11 @@ def run(
             observers=observers,
             locked=True,
         )
-        loaded = load_run(output)
+        loaded = LoadedScene(load_run(output), trained.appearances)
         scores = evaluate(loaded, scene=scene, progress=progress) if scene.test_views else {}
         title = photos.resolve().name
         report, page = output / "report.html", output / "scene.html"
-        summary = f"{len(scene.views)} photos from {title}, {loaded.step} steps of Wild-GS."
+        summary = f"{len(scene.views)} photos from {title}, {trained.steps} steps of Wild-GS."
         write_showcase(report, title, summary, scene, [("Wild-GS", loaded, scores)])
         write_scene_page(loaded, page, title, progress)
     return FinishedRun(output, {str(output): scores} if scores else {}, report, page)
@@ -291,16 +292,19 @@ def demo(
     with lock_run(output):
         folder = write_demo_scene(output / "scene")
         first, second = (_configuration(folder, method, steps) for method in COMPARED)
-        scene, runs = read_scene(first, execution, progress), []
+        runs = []
+        # First of all, since the other process compiles kernels while this one reads photos.
         with training_beside(second, output / second.method, execution) as (give_threads, beside):
+            scene = read_scene(first, execution, progress)
             own = replace(execution, threads=None) if beside else execution
             runs.append(_train_and_score(first, scene, output, own, progress, [*observers, give_threads]))
             if beside is not None and beside.poll() is None:
                 logger.info(f"waiting for the training of {second.method}")
                 beside.wait()
-        runs.append(_train_and_score(second, scene, output, execution, progress, observers))
-        write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
-        write_scene_page(runs[0][1], page, TITLE, progress)
+            give_threads(None)
+            runs.append(_train_and_score(second, scene, output, own, progress, observers))
+            write_showcase(report, TITLE, SUMMARY.format(photos=len(scene.views), steps=steps), scene, runs)
+            write_scene_page(runs[0][1], page, TITLE, progress)
     return FinishedRun(output, {name: scores for name, _, scores in runs}, report, page)
 
 
@@ -311,10 +315,10 @@ def _train_and_score(
     execution: ExecutionConfig,
     progress: Progress | None,
     observers: Sequence[Observer],
-) -> tuple[str, Run, Scores]:
+) -> tuple[str, LoadedScene, Scores]:
     """Trains, or continues, a run of the demo; returns its label, the run and its scores."""
     folder = output / config.method
-    train(
+    trained = train(
         scene,
         config,
         output=folder,
@@ -323,7 +327,7 @@ def _train_and_score(
         progress=progress,
         observers=observers,
     )
-    loaded = load_run(folder)
+    loaded = LoadedScene(load_run(folder), trained.appearances)
     return method_type(config.method).label, loaded, evaluate(loaded, scene=scene, progress=progress)
 
 

@@ -7,7 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +23,7 @@ from wildgs.engine.trainer import Observer, StepReport, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.photos import PhotoFit, describe_misfits, inspect_photos, write_photos
 from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, run_log
+from wildgs.light.photos import KeptAppearances
 from wildgs.progress import Progress, counter, silent
 from wildgs.runs import (
     CHECKPOINT_FOLDER,
@@ -59,6 +60,7 @@ class TrainedRun:
         num_gaussians: Final number of Gaussians.
         device: Name of the GPU, or "the CPU".
         photos: How well each training photo fits; `find_misfits` selects misfits.
+        appearances: Appearances of the training photos under the trained method.
     """
 
     folder: Path
@@ -68,6 +70,7 @@ class TrainedRun:
     num_gaussians: int
     device: str
     photos: Sequence[PhotoFit] = ()
+    appearances: KeptAppearances = field(default_factory=KeptAppearances, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -290,7 +293,8 @@ def _train_to_end(
             )
             raise
         _save_last(saver, writer, trainer.step)
-        result = replace(_result(job, config, trainer), photos=_inspect(job, trainer))
+        result = _result(job, config, trainer)
+        result = replace(result, photos=_inspect(job, trainer, result.appearances))
         logger.info(
             f"{label}: {result.steps} steps in {result.seconds / 60:.1f} min on {result.device}, "
             f"{result.num_gaussians:,} Gaussians -> {folder}"
@@ -300,9 +304,10 @@ def _train_to_end(
     return result
 
 
-def _inspect(job: _Job, trainer: Trainer) -> list[PhotoFit]:
-    """Measures how well each training photo fits and writes the result to the run folder."""
-    photos = inspect_photos(trainer.method, job.scene, counter(job.progress, "inspecting training photos"))
+def _inspect(job: _Job, trainer: Trainer, appearances: KeptAppearances) -> list[PhotoFit]:
+    """Measures how well each training photo fits, writes the result to the run folder and keeps appearances."""
+    show = counter(job.progress, "inspecting training photos")
+    photos = inspect_photos(trainer.method, job.scene, show, appearances.keep)
     write_photos(job.folder, trainer.step, photos)
     return photos
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float, UInt8
@@ -16,6 +16,7 @@ from wildgs.model.method import Method
 from wildgs.progress import Counter
 from wildgs.scene import View
 from wildgs.scene.scene import to_unit
+from wildgs.threads import infer_each
 
 
 @torch.no_grad()
@@ -24,6 +25,40 @@ def encode_view(method: Method, view: View) -> Appearance:
     device = method.gaussians.means.device
     photo, keep = view.load(device)
     return method.encode(photo, view.camera.to(device), keep, name=view.name)
+
+
+class KeptAppearances:
+    """Appearances of photos of a scene under one trained method, each computed once while memory allows.
+
+    Attributes:
+        num_bytes: Memory in use, bytes.
+    """
+
+    def __init__(self, limit: int = 2**28) -> None:
+        """Creates an empty store.
+
+        Args:
+            limit: Limit of the memory in bytes. Appearances that do not fit are computed again at every use.
+        """
+        self.num_bytes = 0
+        self._limit = limit
+        self._kept: dict[str, Appearance] = {}
+
+    def keep(self, name: str, appearance: Appearance) -> None:
+        """Keeps the appearance of the photo with a name, if it fits."""
+        values = (getattr(appearance, each.name) for each in fields(appearance))
+        size = sum(value.untyped_storage().nbytes() for value in values if value is not None)
+        if name not in self._kept and self.num_bytes + size <= self._limit:
+            self._kept[name] = appearance
+            self.num_bytes += size
+
+    def of(self, method: Method, view: View) -> Appearance:
+        """The appearance of a photo of the scene under the method."""
+        if view.name not in self._kept:
+            appearance = encode_view(method, view)
+            self.keep(view.name, appearance)
+            return appearance
+        return self._kept[view.name]
 
 
 @torch.no_grad()
@@ -81,15 +116,23 @@ class Atlas:
 
 
 @torch.no_grad()
-def make_atlas(method: Method, views: Sequence[View], progress: Counter | None = None) -> Atlas:
-    """Encodes the training photos (at least one, at most `MAX_PHOTOS`)."""
+def make_atlas(
+    method: Method,
+    views: Sequence[View],
+    progress: Counter | None = None,
+    kept: KeptAppearances | None = None,
+) -> Atlas:
+    """Encodes the training photos (at least one, at most `MAX_PHOTOS`), except those whose appearances are kept."""
+    kept = kept or KeptAppearances()
     count = min(len(views), MAX_PHOTOS)
     chosen = tuple(views[index * len(views) // count] for index in range(count))
     global_embeddings: list[Tensor] = []
 
     def encoded() -> Iterator[Embeddings]:
-        for number, view in enumerate(chosen, start=1):
-            embeddings = method.embed(encode_view(method, view))
+        each = infer_each(
+            lambda view: method.embed(kept.of(method, view)), chosen, method.gaussians.means.device
+        )
+        for number, embeddings in enumerate(each, start=1):
             global_embeddings.append(embeddings.global_embedding)
             yield embeddings
             if progress is not None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_file
 from wildgs.light.look import NEUTRAL, Look, look_of, own_look
-from wildgs.light.photos import Atlas, encode_photo, encode_picture, encode_view, make_atlas
+from wildgs.light.photos import Atlas, KeptAppearances, encode_photo, encode_picture, make_atlas
 from wildgs.light.saved import SUFFIX, load_look
 from wildgs.model.method import Method
 from wildgs.progress import Progress, counter, silent
@@ -37,7 +37,11 @@ class LightSources:
     """Finds the looks of one scene and caches the last few."""
 
     def __init__(
-        self, method: Method, open_scene: Callable[[], Scene], index_cache: Path | None = None
+        self,
+        method: Method,
+        open_scene: Callable[[], Scene],
+        index_cache: Path | None = None,
+        kept: KeptAppearances | None = None,
     ) -> None:
         """Creates the sources of a trained method.
 
@@ -45,8 +49,10 @@ class LightSources:
             method: The trained method.
             open_scene: Reads the scene, when it is first needed.
             index_cache: File that caches the feature index for localising new photos.
+            kept: Appearances of photos of the scene under this method.
         """
         self.method = method
+        self.appearances = kept or KeptAppearances()
         self._open_scene = open_scene
         self._index_cache = index_cache
         self._index: FeatureIndex | None = None
@@ -100,7 +106,7 @@ class LightSources:
             return load_look(self.method, Path(spec))
         view = match_view(self.scene.views, spec)
         if view is not None:
-            return look_of(self.method, encode_view(self.method, view), view.name)
+            return look_of(self.method, self.appearances.of(self.method, view), view.name)
         file = Path(spec)
         if not is_file(file):
             raise UserError(
@@ -149,7 +155,7 @@ class LightSources:
         """The appearances of all training photos; cached."""
         if self._atlas is None:
             show = counter(progress, "encoding the photos")
-            self._atlas = make_atlas(self.method, self.scene.train_views, show)
+            self._atlas = make_atlas(self.method, self.scene.train_views, show, self.appearances)
         return self._atlas
 
 
