@@ -71,9 +71,10 @@ def make_landmark(
 ) -> None:
     """Renders the demo's landmark into a scene folder.
 
-    It holds `images/` (with EXIF times and places, see `demo_generator.clocks`), `sparse/0/` (COLMAP, exact poses), `split.tsv`, `depth/` (disparity of unknown scale
-    and shift, as a monocular network gives it, 16 bits, 0 = sky) and `truth/` (test photos without visitors;
-    masks: 255 = the place, 0 = a visitor's body, not its shadow). Equal configs give equal files.
+    It holds `images/` (with EXIF times and places, see `demo_generator.clocks`), `sparse/0/` (COLMAP, exact poses),
+    `split.tsv`, `depth/` (disparity of unknown scale and shift, as a monocular network gives it, 16 bits, 0 = sky)
+    and `truth/` (test photos without visitors; masks: 255 = the place, 0 = a visitor's body, not its shadow). Equal
+    configs give equal files.
 
     Args:
         output: The scene folder; made where it is missing.
