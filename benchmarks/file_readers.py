@@ -34,8 +34,8 @@ from PIL import Image
 import wildgs
 from benchmarks.page_fps import FLAGS
 from wildgs.geometry.camera import Camera
-from wildgs.library.day import start_view
 from wildgs.library.loaded import LoadedScene
+from wildgs.scene.start import choose_start
 
 HERE = Path(__file__).parent / "readers"
 READERS = ("playcanvas", "babylon")
@@ -85,7 +85,7 @@ def start_camera(loaded: LoadedScene, yfov: float) -> Camera:
     """The camera of the start view with a centred principal point."""
     focal = 0.5 * HEIGHT / math.tan(yfov / 2)
     K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(start_view(loaded).camera.viewmat, K, WIDTH, HEIGHT)
+    return Camera(choose_start(loaded.scene)[0].camera.viewmat, K, WIDTH, HEIGHT)
 
 
 def check_usd(file: Path) -> None:

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.photos import find_misfits, read_photos
-from wildgs.exporters.page import choose_start
 from wildgs.files import is_file, read_json, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
@@ -32,6 +31,7 @@ from wildgs.scene import View
 from wildgs.scene.capture import Capture, read_capture
 from wildgs.scene.colmap import find_model
 from wildgs.scene.photo_store import with_ending
+from wildgs.scene.start import choose_start
 
 DAY_FILE = "day.json"
 """Caches the day in the run folder; valid for one checkpoint."""
@@ -174,12 +174,6 @@ def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:
     return len(phases) == len(names) > 1 and phases == sorted(phases)
 
 
-def start_view(loaded: LoadedScene) -> View:
-    """The photo that shows the scene complete and large."""
-    views = loaded.scene.train_views or loaded.views
-    return views[choose_start([view.camera for view in views], loaded.scene.points)[0]]
-
-
 def day_timeline(
     loaded: LoadedScene, day: Day, camera: Camera | None = None, *, progress: Progress | None = None
 ) -> Timeline:
@@ -188,12 +182,12 @@ def day_timeline(
     Args:
         loaded: The run.
         day: From `find_day`.
-        camera: Camera for measuring the changes; None takes `start_view`.
+        camera: Camera for measuring the changes; None takes that of `wildgs.scene.start.choose_start`.
         progress: Called for every rendered image.
     """
     looks = tuple(loaded.appearance(name) for name in day.keys)
     timeline = Timeline(looks)
-    camera = camera or start_view(loaded).camera
+    camera = camera or choose_start(loaded.scene)[0].camera
     shrink = min(1.0, _SIDE / max(camera.width, camera.height))
     camera = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
     count, show = _SAMPLES * (len(looks) - 1) + 1, counter(progress, "pacing the day")
