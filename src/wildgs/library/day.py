@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, v
 from wildgs.light.look import Timeline
 from wildgs.light.photos import MAX_PHOTOS, encode_view
 from wildgs.light.shadows import SIDE, SunFinder
-from wildgs.light.sun import phase_of
+from wildgs.light.sun import phases_of
 from wildgs.progress import Progress, counter
 from wildgs.scene import View
 from wildgs.scene.capture import Capture, read_capture
@@ -34,7 +33,10 @@ from wildgs.scene.photo_store import with_ending
 from wildgs.scene.start import choose_start
 
 DAY_FILE = "day.json"
-"""Caches the day in the run folder; valid for one checkpoint."""
+"""Caches the day in the run folder; valid for one checkpoint and one `DAY_VERSION`."""
+
+DAY_VERSION = 2
+"""To be raised with every change that orders the photos of a run differently."""
 
 _SAMPLES = 4
 """Images between two key frames from which the pace is measured."""
@@ -66,29 +68,16 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
         raise UserError(
             f"{loaded.run.folder}: --over day needs a run that can be relit, with at least {LEAST_PHOTOS} photos"
         )
-    places = [capture.place for capture in captures.values() if capture.place is not None]
-    place = tuple(np.median(places, axis=0).tolist()) if places else None
-    times = {name: phase_of(capture, place) for name, capture in _comparable(captures, place).items()}
     lights = _lights(loaded, views, progress)
-    day = plan_day(lights.patterns, times, partial(_find_suns, loaded, views, lights))
+    day = plan_day(lights.patterns, phases_of(captures), _find_suns(loaded, views, lights))
     assert day is not None  # there are enough photos
     try:
         with written_aside(kept) as aside:
-            content = {"step": loaded.run.step, "timed": timed, **asdict(day)}
+            content = {"version": DAY_VERSION, "step": loaded.run.step, "timed": timed, **asdict(day)}
             aside.write_text(json.dumps(content, indent=1), encoding="utf-8")
     except UserError:  # a run on a read-only disk works without the cache
         pass
     return day
-
-
-def _comparable(captures: dict[str, Capture], place: tuple | None) -> dict[str, Capture]:
-    """Captures on one clock: those with a solar time if they are the majority, else all by local time."""
-    solar = {name: each for name, each in captures.items() if each.utc is not None and (each.place or place)}
-    return (
-        solar
-        if 2 * len(solar) > len(captures)
-        else {name: Capture(each.local) for name, each in captures.items()}
-    )
 
 
 def _usable_views(loaded: LoadedScene) -> list[View]:
@@ -138,13 +127,17 @@ def _digest(captures: dict[str, Capture]) -> str:
 
 
 def _read(file: Path, loaded: LoadedScene, timed: str | None = None) -> Day | None:
-    """Reads the cached day; None if it is damaged or outdated (another checkpoint, or other times than `timed`)."""
+    """Reads the cached day; None if it is damaged or outdated.
+
+    It is outdated if it is of another version or checkpoint, or made with other times than `timed`.
+    """
     try:
         content = read_json(file)
-        found_step, found_timed = content.pop("step"), content.pop("timed")
-        if found_step != loaded.run.step or timed not in (None, found_timed):
+        version, found_step, found_timed = (content.pop(entry) for entry in ("version", "step", "timed"))
+        if version != DAY_VERSION or found_step != loaded.run.step or timed not in (None, found_timed):
             return None
-        day = Day(**{**content, "keys": tuple(content["keys"]), "left_out": {**content["left_out"]}})
+        lists = {entry: tuple(content[entry]) for entry in ("keys", "untimed")}
+        day = Day(**content | lists | {"left_out": {**content["left_out"]}})
         known = set(day.keys) <= set(day.phases) <= {view.name for view in loaded.views}
         return day if day.keys and known and all(map(math.isfinite, day.phases.values())) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
