@@ -268,7 +268,7 @@ def _cross_validated(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, 
 
 
 def _day(
-    names: Sequence[str],
+    names: list[str],
     axes: Float[np.ndarray, "P C"],
     phases: Float[np.ndarray, " P"],
     timed: Int[np.ndarray, " T"],
