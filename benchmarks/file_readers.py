@@ -34,8 +34,8 @@ from PIL import Image
 import wildgs
 from benchmarks.page_fps import FLAGS
 from wildgs.geometry.camera import Camera
-from wildgs.library.day import start_view
 from wildgs.library.loaded import LoadedScene
+from wildgs.scene.start import choose_start
 
 HERE = Path(__file__).parent / "readers"
 READERS = ("playcanvas", "babylon")
@@ -85,7 +85,7 @@ def start_camera(loaded: LoadedScene, yfov: float) -> Camera:
     """The camera of the start view with a centred principal point."""
     focal = 0.5 * HEIGHT / math.tan(yfov / 2)
     K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(start_view(loaded).camera.viewmat, K, WIDTH, HEIGHT)
+    return Camera(choose_start(loaded.scene)[0].camera.viewmat, K, WIDTH, HEIGHT)
 
 
 def check_usd(file: Path) -> None:
@@ -116,9 +116,8 @@ def compare(loaded: LoadedScene, names: list[str], folder: Path, output: Path) -
     arguments = ["--bundle", "--format=iife", "--log-level=error", f"--outdir={folder}"]
     scripts = [str(HERE / f"{reader}.js") for reader in READERS]
     subprocess.run([str(HERE / "node_modules" / ".bin" / "esbuild"), *scripts, *arguments], check=True)
-    program = shutil.which("chromium") or shutil.which("google-chrome")
     with served(folder) as address, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=_browser(), args=FLAGS)
         for number, name in enumerate(names):
             shown = [loaded.render(ours, loaded.appearance(name)).numpy()]
             for reader in READERS:
@@ -140,9 +139,15 @@ def compare(loaded: LoadedScene, names: list[str], folder: Path, output: Path) -
         browser.close()
 
 
+def _browser() -> str | None:
+    return shutil.which("chromium") or shutil.which("google-chrome")
+
+
 def main(command: Command) -> None:
     if not (HERE / "node_modules").is_dir():
         sys.exit("first run: npm install --prefix benchmarks/readers")
+    if _browser() is None:
+        sys.exit("install Chromium or Google Chrome, and put it on the PATH as chromium or google-chrome")
     loaded = wildgs.load(command.run, device="cpu")
     views = loaded.scene.train_views
     count = min(command.lights, len(views))

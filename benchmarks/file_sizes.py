@@ -19,12 +19,12 @@ from torch import Tensor
 import wildgs
 from wildgs.exporters.glb import glb_bytes
 from wildgs.exporters.lights import ExportLight, RelightableScene, share_harmonics, upright
-from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
+from wildgs.exporters.page import Page, PageLight, PageView, write_page
 from wildgs.exporters.splats import CleanupConfig, Splats
-from wildgs.library.day import start_view
 from wildgs.library.loaded import LoadedScene, find_looks
 from wildgs.library.pages import baked, viewpoints_of
 from wildgs.model.gaussians import NEAR
+from wildgs.scene.start import choose_start
 
 LIGHTS = (1, 4, 8)
 PAGE_LIGHTS = 6
@@ -64,7 +64,7 @@ def repeat_splats(splats: Splats, count: int) -> Splats:
 
 def print_glb(loaded: LoadedScene, lights: list[Splats], names: list[str], count: int) -> None:
     motion = upright(loaded.run.alignment, aligned=False)
-    start = start_view(loaded)
+    start = choose_start(loaded.scene)[0]
     splats = repeat_splats(lights[0], count)
     shs = [splats.with_sh(repeat(each.sh, count, 0.02)).moved(motion).sh for each in lights]
     moved, viewpoints, single = (
@@ -88,16 +88,15 @@ def print_glb(loaded: LoadedScene, lights: list[Splats], names: list[str], count
 
 
 def print_page(loaded: LoadedScene, lights: list[Splats], names: list[str], count: int) -> None:
-    views = loaded.scene.train_views
-    number, depth = choose_start([view.camera for view in views], loaded.scene.points)
-    photo = views[number].read_photo().numpy()
+    start, depth = choose_start(loaded.scene)
+    photo = start.read_photo().numpy()
     shown = [
         PageLight(name, repeat(each.sh, count, 0.02), photo)
         for name, each in zip(names[:PAGE_LIGHTS], lights, strict=False)
     ]
     page = Page(
         title="sizes", summary="", splats=repeat_splats(lights[0], count), lights=shown,
-        start=PageView(views[number].camera, depth), near=NEAR, day=True,
+        start=PageView(start.camera, depth), near=NEAR, day=True,
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "page.html")

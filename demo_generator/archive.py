@@ -26,8 +26,9 @@ def pack(folder: Path, archive: Path) -> None:
 def share_of_differences(folder: Path, archive: Path) -> dict[str, float]:
     """Compares each file of a folder with the archive's entry of the same name.
 
-    Pictures are compared by their decoded values, because encoders differ between versions of a library, and
-    everything else by its bytes. A picture of another shape and a file that the archive lacks differ in full.
+    Pictures are compared by their decoded values and their EXIF blocks, because encoders differ between versions of
+    a library, and everything else by its bytes. A picture of another shape or with a block of another length, and a
+    file that the archive lacks, differ in full.
 
     Args:
         folder: A scene folder, or a part of one.
@@ -54,4 +55,5 @@ def _values(suffix: str, data: bytes) -> np.ndarray:
     if suffix not in _PICTURES:
         return np.frombuffer(data, dtype=np.uint8)
     with Image.open(io.BytesIO(data)) as picture:
-        return np.asarray(picture)
+        pixels, block = np.asarray(picture), np.frombuffer(picture.info.get("exif", b""), dtype=np.uint8)
+    return np.concatenate([np.array(pixels.shape), pixels.ravel(), block])

@@ -12,6 +12,7 @@ from PIL import Image
 
 from demo_generator.camera_response import develop, draw_response, metered_gain
 from demo_generator.cameras import Viewpoint, draw_viewpoint
+from demo_generator.clocks import add_clock
 from demo_generator.landmark import add_landmark
 from demo_generator.lighting import Light, draw_light
 from demo_generator.render import Rendered, is_free, render, visible_share
@@ -37,7 +38,7 @@ class SyntheticConfig:
         samples: Samples per pixel along each axis.
         points: Sparse points to look for.
         least_views: Photos that have to see a sparse point.
-        seed: Photographers, hours, cameras and passers-by; the landmark stays the same.
+        seed: Photographers, hours, clocks, cameras and passers-by; the landmark stays the same.
     """
 
     photos: int = 40
@@ -70,9 +71,10 @@ def make_landmark(
 ) -> None:
     """Renders the demo's landmark into a scene folder.
 
-    It holds `images/`, `sparse/0/` (COLMAP, exact poses), `split.tsv`, `depth/` (disparity of unknown scale
-    and shift, as a monocular network gives it, 16 bits, 0 = sky) and `truth/` (test photos without visitors;
-    masks: 255 = the place, 0 = a visitor's body, not its shadow). Equal configs give equal files.
+    It holds `images/` (with EXIF times and places, see `demo_generator.clocks`), `sparse/0/` (COLMAP, exact poses),
+    `split.tsv`, `depth/` (disparity of unknown scale and shift, as a monocular network gives it, 16 bits, 0 = sky)
+    and `truth/` (test photos without visitors; masks: 255 = the place, 0 = a visitor's body, not its shadow). Equal
+    configs give equal files.
 
     Args:
         output: The scene folder; made where it is missing.
@@ -149,7 +151,9 @@ def _take_photo(index: int, place: _Place, config: SyntheticConfig, output: Path
     gain = metered_gain(shot.radiance)
     pixels = develop(shot.radiance, gain, response, seed=index)
     name = f"landmark_{index:02d}"
-    Image.fromarray(pixels).save(output / "images" / f"{name}.jpg", quality=92, subsampling=0, optimize=True)
+    photo = output / "images" / f"{name}.jpg"
+    Image.fromarray(pixels).save(photo, quality=92, subsampling=0, optimize=True)
+    add_clock(photo, index, light, config.seed)
     _write_png(disparity_prior(shot.depth, rng), output / "depth" / f"{name}.png")
     mask = np.where(shot.visitor, 0, 255).astype(np.uint8)
     _write_png(mask, output / "truth" / "masks" / f"{name}.png")

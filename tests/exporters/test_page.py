@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from wildgs.exporters import page as page_module
-from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
+from wildgs.exporters.page import Page, PageLight, PageView, write_page
 from wildgs.exporters.splats import Splats
 from wildgs.geometry.camera import Camera
 
@@ -96,21 +96,3 @@ def test_degrees_are_given_up_until_the_page_fits(
     assert write_page(page, file, viewpoints=torch.zeros(1, 3)) == 2
     assert file.stat().st_size < whole
     assert write_page(page, file, sh_degree=1) == 1
-
-
-def _camera(distance: float, sideways: float = 0.0) -> Camera:
-    viewmat = torch.eye(4)
-    viewmat[:3, 3] = torch.tensor([-sideways, 0.0, distance])
-    return Camera(viewmat, torch.tensor([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]), 64, 48)
-
-
-def test_neither_too_near_nor_too_far_nor_looking_past_it() -> None:
-    points = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    cameras = [_camera(12.0), _camera(1.2), _camera(3.0), _camera(3.0, 5.0), _camera(-3.0)]
-    index, depth = choose_start(cameras, points)
-    assert index == 2
-    assert depth == pytest.approx(3.0, abs=0.3)
-
-
-def test_a_scene_without_points_still_opens() -> None:
-    assert choose_start([_camera(3.0)], torch.zeros(0, 3)) == (0, 1.0)

@@ -19,7 +19,15 @@ import wildgs
 from wildgs.errors import UserError
 from wildgs.library import day as day_module
 from wildgs.library.config import TrajectoryOptions
-from wildgs.library.day import DAY_FILE, day_timeline, find_day, in_order_of_day, known_day, read_captures
+from wildgs.library.day import (
+    DAY_FILE,
+    DAY_VERSION,
+    day_timeline,
+    find_day,
+    in_order_of_day,
+    known_day,
+    read_captures,
+)
 from wildgs.light.day import plan_day
 from wildgs.light.shadows import SIDE, SunFinder
 from wildgs.model.appearance import Appearance
@@ -46,8 +54,10 @@ def test_a_day_is_found_once_and_kept(run: Path) -> None:
     assert in_order_of_day(scene, day.keys)
     assert not in_order_of_day(scene, day.keys[::-1])
     content = json.loads((run / DAY_FILE).read_text(encoding="utf-8"))
-    (run / DAY_FILE).write_text(json.dumps({**content, "step": 1}), encoding="utf-8")
-    assert known_day(scene) is None
+    without = {key: value for key, value in content.items() if key != "version"}
+    for old in ({**content, "step": 1}, {**content, "version": DAY_VERSION - 1}, without):
+        (run / DAY_FILE).write_text(json.dumps(old), encoding="utf-8")
+        assert known_day(scene) is None
     (run / DAY_FILE).write_text("{", encoding="utf-8")
     assert find_day(scene) == day
 

@@ -33,7 +33,7 @@ class Command:
     """Appearances to which the light changes during the video, in this order."""
     over: Literal["day"] | None = None
     """day: the course of a day, from night through morning and noon to evening, instead of --appearance and --to.
-    Photos are ordered by EXIF time if it fits most of them, else by their light."""
+    Photos are ordered by EXIF time if it fits the light of most, those without a time by their light."""
     photos: Path | None = None
     """For --over: folder of the original photos, whose EXIF data holds the time. Default: the scene's images."""
     view: tuple[str, ...] = ()
@@ -66,8 +66,13 @@ def run(command: Command) -> None:
         )
     print_notes(done.looks)
     if done.day is not None:
-        order = "EXIF time" if done.day.by_time else "light (EXIF times are missing or contradict it)"
-        console.print(f"{len(done.day.phases)} photos ordered by {order}; shown: {', '.join(done.day.keys)}")
+        count = len(done.day.phases)
+        order = f"{count} photos ordered by light (EXIF times are missing or contradict it)"
+        if done.day.by_time:
+            order = f"{count - len(done.day.untimed)} photos ordered by EXIF time"
+        if done.day.untimed:
+            order += f", {len(done.day.untimed)} without a time by their light"
+        console.print(f"{order}; shown: {', '.join(done.day.keys)}")
         for name, reason in done.day.left_out.items():
             console.print(f"{name} is left out: {reason}")
     if done.fps is None:

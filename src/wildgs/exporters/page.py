@@ -27,9 +27,6 @@ from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
 BUDGET_BYTES = 25_000_000
 """Size limit of a page; spherical harmonics are truncated to stay below it."""
 
-_MIDDLE = 0.3
-"""Half the size of the central part of an image whose points determine the depth of the landmark."""
-
 
 @dataclass(frozen=True)
 class PageLight:
@@ -155,46 +152,3 @@ def _start(view: PageView) -> dict[str, Any]:
         "fov_y": float(2 * torch.atan(0.5 * camera.height / camera.K[1, 1])),
         "aspect": float(camera.width / camera.height * camera.K[1, 1] / camera.K[0, 0]),
     }
-
-
-def choose_start(cameras: Sequence[Camera], points: Float[Tensor, "P 3"]) -> tuple[int, float]:
-    """Chooses a photo that shows the landmark complete and large.
-
-    Args:
-        cameras: Cameras of the training photos, at least one.
-        points: SfM points in the same frame.
-
-    Returns:
-        Index of the camera, and the depth of the landmark in its view.
-    """
-    scores = torch.tensor([_score(camera, points) for camera in cameras])
-    best = int(scores.argmax())
-    return best, _depth(cameras[best], points)
-
-
-def _project(camera: Camera, points: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
-    """Image coordinates (0 to 1 on each axis) and depths of the points in front of the camera."""
-    pixels, depths = camera.project(points)
-    before = depths > 1e-3
-    return pixels[before] / torch.tensor([camera.width, camera.height]).to(points), depths[before]
-
-
-def _score(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Fraction of the points inside the image, times the fraction of the image that they cover.
-
-    The first factor is small for cameras that are too close, the second for those that are too far away.
-    """
-    places, _ = _project(camera, points)
-    inside = places[((places >= 0) & (places <= 1)).all(dim=1)]
-    if len(inside) < 2:
-        return 0.0
-    spread = inside.quantile(0.95, dim=0) - inside.quantile(0.05, dim=0)
-    return len(inside) / len(points) * float(spread.prod().sqrt())
-
-
-def _depth(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Median depth of the points in the central part of the image."""
-    places, depths = _project(camera, points)
-    middle = ((places - 0.5).abs() < _MIDDLE).all(dim=1)
-    chosen = depths[middle] if bool(middle.any()) else depths
-    return float(chosen.median()) if len(chosen) else 1.0

@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.photos import find_misfits, read_photos
-from wildgs.exporters.page import choose_start
 from wildgs.files import is_file, read_json, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.library.loaded import LoadedScene
@@ -26,16 +24,20 @@ from wildgs.light.day import LEAST_PHOTOS, Day, Pattern, pattern_of, plan_day, v
 from wildgs.light.look import Timeline
 from wildgs.light.photos import MAX_PHOTOS
 from wildgs.light.shadows import SIDE, SunFinder
-from wildgs.light.sun import phase_of
+from wildgs.light.sun import phases_of
 from wildgs.progress import Progress, counter
 from wildgs.scene import View
 from wildgs.scene.capture import Capture, read_capture
 from wildgs.scene.colmap import find_model
 from wildgs.scene.photo_store import with_ending
+from wildgs.scene.start import choose_start
 from wildgs.threads import infer_each
 
 DAY_FILE = "day.json"
-"""Caches the day in the run folder; valid for one checkpoint."""
+"""Caches the day in the run folder; valid for one checkpoint and one `DAY_VERSION`."""
+
+DAY_VERSION = 2
+"""To be raised with every change that orders the photos of a run differently."""
 
 _SAMPLES = 4
 """Images between two key frames from which the pace is measured."""
@@ -67,29 +69,16 @@ def find_day(loaded: LoadedScene, photos: Path | None = None, *, progress: Progr
         raise UserError(
             f"{loaded.run.folder}: --over day needs a run that can be relit, with at least {LEAST_PHOTOS} photos"
         )
-    places = [capture.place for capture in captures.values() if capture.place is not None]
-    place = tuple(np.median(places, axis=0).tolist()) if places else None
-    times = {name: phase_of(capture, place) for name, capture in _comparable(captures, place).items()}
     lights = _lights(loaded, views, progress)
-    day = plan_day(lights.patterns, times, partial(_find_suns, loaded, views, lights))
+    day = plan_day(lights.patterns, phases_of(captures), _find_suns(loaded, views, lights))
     assert day is not None  # there are enough photos
     try:
         with written_aside(kept) as aside:
-            content = {"step": loaded.run.step, "timed": timed, **asdict(day)}
+            content = {"version": DAY_VERSION, "step": loaded.run.step, "timed": timed, **asdict(day)}
             aside.write_text(json.dumps(content, indent=1), encoding="utf-8")
     except UserError:  # a run on a read-only disk works without the cache
         pass
     return day
-
-
-def _comparable(captures: dict[str, Capture], place: tuple | None) -> dict[str, Capture]:
-    """Captures on one clock: those with a solar time if they are the majority, else all by local time."""
-    solar = {name: each for name, each in captures.items() if each.utc is not None and (each.place or place)}
-    return (
-        solar
-        if 2 * len(solar) > len(captures)
-        else {name: Capture(each.local) for name, each in captures.items()}
-    )
 
 
 def _usable_views(loaded: LoadedScene) -> list[View]:
@@ -148,13 +137,17 @@ def _digest(captures: dict[str, Capture]) -> str:
 
 
 def _read(file: Path, loaded: LoadedScene, timed: str | None = None) -> Day | None:
-    """Reads the cached day; None if it is damaged or outdated (another checkpoint, or other times than `timed`)."""
+    """Reads the cached day; None if it is damaged or outdated.
+
+    It is outdated if it is of another version or checkpoint, or made with other times than `timed`.
+    """
     try:
         content = read_json(file)
-        found_step, found_timed = content.pop("step"), content.pop("timed")
-        if found_step != loaded.run.step or timed not in (None, found_timed):
+        version, found_step, found_timed = (content.pop(entry) for entry in ("version", "step", "timed"))
+        if version != DAY_VERSION or found_step != loaded.run.step or timed not in (None, found_timed):
             return None
-        day = Day(**{**content, "keys": tuple(content["keys"]), "left_out": {**content["left_out"]}})
+        lists = {entry: tuple(content[entry]) for entry in ("keys", "untimed")}
+        day = Day(**content | lists | {"left_out": {**content["left_out"]}})
         known = set(day.keys) <= set(day.phases) <= {view.name for view in loaded.views}
         return day if day.keys and known and all(map(math.isfinite, day.phases.values())) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -184,12 +177,6 @@ def in_order_of_day(loaded: LoadedScene, names: Sequence[str]) -> bool:
     return len(phases) == len(names) > 1 and phases == sorted(phases)
 
 
-def start_view(loaded: LoadedScene) -> View:
-    """The photo that shows the scene complete and large."""
-    views = loaded.scene.train_views or loaded.views
-    return views[choose_start([view.camera for view in views], loaded.scene.points)[0]]
-
-
 def day_timeline(
     loaded: LoadedScene, day: Day, camera: Camera | None = None, *, progress: Progress | None = None
 ) -> Timeline:
@@ -198,12 +185,12 @@ def day_timeline(
     Args:
         loaded: The run.
         day: From `find_day`.
-        camera: Camera for measuring the changes; None takes `start_view`.
+        camera: Camera for measuring the changes; None takes that of `wildgs.scene.start.choose_start`.
         progress: Called for every rendered image.
     """
     looks = tuple(loaded.appearance(name) for name in day.keys)
     timeline = Timeline(looks)
-    camera = camera or start_view(loaded).camera
+    camera = camera or choose_start(loaded.scene)[0].camera
     shrink = min(1.0, _SIDE / max(camera.width, camera.height))
     camera = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
     count, show = _SAMPLES * (len(looks) - 1) + 1, counter(progress, "pacing the day")

@@ -15,7 +15,6 @@ from wildgs.exporters.config import CleanupConfig
 from wildgs.exporters.formats import SplatFormat, SpzVersion, write_splats
 from wildgs.exporters.glb import glb_bytes
 from wildgs.exporters.lights import ExportLight, RelightableScene, SharedHarmonics, share_harmonics, upright
-from wildgs.exporters.page import choose_start
 from wildgs.exporters.splats import Splats, agreement, clean
 from wildgs.exporters.usd import write_usd
 from wildgs.files import written_aside
@@ -28,6 +27,7 @@ from wildgs.light.look import NEUTRAL, Look
 from wildgs.model.gaussians import NEAR
 from wildgs.progress import Progress
 from wildgs.scene import Alignment
+from wildgs.scene.start import choose_start
 
 COMPARED_VIEWS = 4
 
@@ -141,8 +141,7 @@ def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> 
     viewpoints = viewpoints_of(collection.views)
     motion = upright(loaded.run.alignment, aligned=request.aligned)
     splats = [_cleaned(request, look).moved(motion) for look in looks]
-    views = collection.train_views or collection.views
-    start = choose_start([view.camera for view in views], collection.points)[0]
+    start, _ = choose_start(collection)
     times = read_times(loaded)
     harmonics = share_harmonics(
         splats[0],
@@ -154,10 +153,10 @@ def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> 
         title=request.title,
         splats=splats[0],
         lights=[
-            ExportLight(look.name, each.sh, thumbnail(loaded, look, views[start]), times.get(look.name))
+            ExportLight(look.name, each.sh, thumbnail(loaded, look, start), times.get(look.name))
             for look, each in zip(looks, splats, strict=True)
         ],
-        start=motion.apply_camera(views[start].camera),
+        start=motion.apply_camera(start.camera),
         near=NEAR * motion.scale,
         placement=_to_colmap(motion, loaded.run.alignment),
     )

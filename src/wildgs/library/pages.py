@@ -13,7 +13,7 @@ from torch import Tensor
 
 from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.photos import PhotoFit, find_misfits, read_photos
-from wildgs.exporters.page import Page, PageLight, PageView, choose_start, write_page
+from wildgs.exporters.page import Page, PageLight, PageView, write_page
 from wildgs.exporters.report import (
     MethodScores,
     Report,
@@ -34,6 +34,7 @@ from wildgs.model.method import Method
 from wildgs.progress import Progress
 from wildgs.scene import Scene, View, match_view
 from wildgs.scene.images import UnreadableImageError, read_photo
+from wildgs.scene.start import choose_start
 from wildgs.sfm.report import describe_placed, read_left_out
 from wildgs.threads import infer_each
 
@@ -74,20 +75,18 @@ def write_webpage(
     """
     cleanup = cleanup or CleanupConfig()
     scene = loaded.scene
-    views = scene.train_views or scene.views
-    number, depth = choose_start([view.camera for view in views], scene.points)
+    start, depth = choose_start(scene)
     splats = baked(loaded, looks[0])
     keep = kept_rows(cleanup, splats, scene.points)
     lights = [
-        PageLight(look.name, look.sh.cpu().detach()[keep], thumbnail(loaded, look, views[number]))
-        for look in looks
+        PageLight(look.name, look.sh.cpu().detach()[keep], thumbnail(loaded, look, start)) for look in looks
     ]
     page = Page(
         title=title,
         summary=f"{int(keep.sum()):,} Gaussians from {len(scene.views)} photos, by Wild-GS.",
         splats=splats.select(keep),
         lights=lights,
-        start=PageView(views[number].camera, depth),
+        start=PageView(start.camera, depth),
         near=NEAR,
         day=in_order_of_day(loaded, [look.name for look in looks]),
     )

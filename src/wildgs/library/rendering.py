@@ -18,12 +18,13 @@ from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.trajectory import still
 from wildgs.library.config import MixOptions, TrajectoryOptions
-from wildgs.library.day import day_timeline, find_day, start_view
+from wildgs.library.day import day_timeline, find_day
 from wildgs.library.loaded import LoadedScene, find_looks, loaded
 from wildgs.light.day import Day
 from wildgs.light.look import NEUTRAL, Look, Timeline
 from wildgs.progress import Progress, counter
 from wildgs.scene import View, find_view
+from wildgs.scene.start import choose_start
 from wildgs.scene.trajectories import AROUND, THROUGH, read_path
 
 DEFAULT_PATH = "orbit"
@@ -126,7 +127,7 @@ def _render_day(
     """Renders a video over the course of a day."""
     check_output(output)
     if trajectory.path == "still" and not views:
-        views = [start_view(scene).name]
+        views = [choose_start(scene.scene)[0].name]
     seconds = DAY_SECONDS if trajectory.seconds is None else trajectory.seconds
     cameras, fps = _find_cameras(scene, replace(trajectory, seconds=seconds), views)
     day = find_day(scene, None if photos is None else Path(photos), progress=progress)

@@ -4,17 +4,18 @@ The luminance of every Gaussian relative to the scene's mean does not depend on 
 mostly with the elevation of the sun: lit and shaded sides, long shadows, lamps. A regression for each scene
 predicts the elevation from it, trained on capture times if known, otherwise on two estimates that hold for any
 scene: the direction of the sun by shading and shadows (`wildgs.light.shadows`), and the colours (with a low sun,
-photos are warm, and lit sides are warmer than shaded ones).
+photos are warm, and lit sides are warmer than shaded ones). These estimates are also regressors for capture times,
+so that a few of them suffice, and place photos without a capture time between the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from wildgs.geometry.spherical_harmonics import C0
@@ -30,8 +31,9 @@ KEYS = 9
 
 LEAST_PHOTOS = 5
 
-_COMPONENTS, _RIDGE = 8, 0.005
-"""Number of principal components on which times are regressed, and ridge of the regression."""
+_COMPONENTS, _HEIGHT_WEIGHT, _RIDGE = 8, 6.0, 1.0
+"""Number of principal components on which elevations by time are regressed, weight of the elevation by light beside
+them, and ridge of the regression."""
 
 _PATTERN_RIDGE = 0.02
 """Ridge of the regression of estimates on the unwhitened patterns, relative to their variance."""
@@ -69,12 +71,14 @@ class Day:
             Ascending. Without capture times the scale is arbitrary.
         keys: Key photos of the day, in order.
         by_time: Whether photos are ordered by capture time instead of by light.
+        untimed: If so, photos that have no capture time and are placed between the others by light.
         left_out: Photos whose capture time contradicts their light, with the reason.
     """
 
     phases: dict[str, float]
     keys: tuple[str, ...]
     by_time: bool
+    untimed: tuple[str, ...]
     left_out: dict[str, str]
 
 
@@ -101,17 +105,15 @@ def pattern_of(sh: Float[Tensor, "M K 3"]) -> Pattern:
 
 
 def plan_day(
-    patterns: Mapping[str, Pattern],
-    times: Mapping[str, float],
-    find_suns: Callable[[], Float[np.ndarray, "P 3"]],
+    patterns: Mapping[str, Pattern], times: Mapping[str, float], suns: Float[np.ndarray, "P 3"]
 ) -> Day | None:
     """Orders photos by the elevation of the sun and selects key photos.
 
     Args:
         patterns: Patterns of the photos' lights, by name.
-        times: Phases of the day (`wildgs.light.sun.phase_of`) of photos with a capture time.
-        find_suns: Estimates the direction of the sun in each photo, in the order of `patterns`, in the aligned
-            frame (`SunFinder.direction`). Called only if the times do not decide.
+        times: Phases of the day (`wildgs.light.sun.phases_of`) of photos with a capture time.
+        suns: Estimated direction of the sun in each photo, in the order of `patterns`, in the aligned frame
+            (`SunFinder.direction`).
 
     Returns:
         None if there are fewer than `LEAST_PHOTOS` photos.
@@ -120,27 +122,66 @@ def plan_day(
     if len(names) < LEAST_PHOTOS:
         return None
     luminance = np.stack([patterns[name].luminance for name in names])
-    axes = _components(luminance)
-    timed = [index for index, name in enumerate(names) if name in times]
+    axes, rising = _components(luminance), _is_morning(suns)
+    height = _height_by_light(list(patterns.values()), luminance, suns)
+    timed = np.array([index for index, name in enumerate(names) if name in times], dtype=int)
     if len(timed) >= _LEAST_TIMED:
-        phases = np.array([times[names[index]] for index in timed])
-        kept, agreement = _consistent_times(axes[timed], NOON - np.abs(phases - NOON))
-        if agreement >= _LEAST_AGREEMENT:
-            left = {
-                names[index]: "its capture time contradicts its light"
-                for index, keep in zip(timed, kept, strict=True)
-                if not keep
-            }
-            chosen = [index for index, keep in zip(timed, kept, strict=True) if keep]
-            return _day(names, axes, np.array(chosen), phases[kept], left, by_time=True)
-    suns = find_suns()
-    rough = _rough_height(list(patterns.values()), suns[:, 2])
-    toneless = without_tone(torch.from_numpy(luminance), torch.from_numpy(luminance.mean(axis=0))).numpy()
-    height = _learn(_by_variance(toneless), rough, _PATTERN_RIDGE)
-    rising = _is_morning(suns)
+        told = np.array([times[names[index]] for index in timed])
+        found = _by_time(_predictors(axes, height), rising, timed, told)
+        if found is not None:
+            phases, wrong = found
+            return _day(names, axes, phases, timed, wrong)
     rank = (height.argsort().argsort() + 0.5) / len(names) * 180 - 90
-    phases = np.where(rising, rank, 180 - rank)
-    return _day(names, axes, np.arange(len(names)), phases, {}, by_time=False)
+    nobody = np.zeros(0, dtype=int)
+    return _day(names, axes, np.where(rising, rank, 180 - rank), nobody, nobody)
+
+
+def _height_by_light(
+    patterns: Sequence[Pattern], luminance: Float[np.ndarray, "P M"], suns: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, " P"]:
+    """The sun's elevation by the light alone, on an arbitrary scale."""
+    rough = _rough_height(patterns, suns[:, 2])
+    toneless = without_tone(torch.from_numpy(luminance), torch.from_numpy(luminance.mean(axis=0))).numpy()
+    return _learn(_by_variance(toneless), rough, _PATTERN_RIDGE)
+
+
+def _predictors(axes: Float[np.ndarray, "P C"], height: Float[np.ndarray, " P"]) -> Float[np.ndarray, "P _"]:
+    """What elevations are regressed on: the elevation by light alone, and, with less weight, the components."""
+    height = (height - height.mean()) / max(float(height.std()), 1e-9)
+    return np.column_stack([_HEIGHT_WEIGHT * height, axes])
+
+
+def _by_time(
+    predictors: Float[np.ndarray, "P C"],
+    rising: Bool[np.ndarray, " P"],
+    timed: Int[np.ndarray, " T"],
+    told: Float[np.ndarray, " T"],
+) -> tuple[Float[np.ndarray, " P"], Int[np.ndarray, " W"]] | None:
+    """Phases of all photos by the capture times of some.
+
+    Args:
+        predictors: From `_predictors`.
+        rising: Whether photos are of the morning, by their shadows.
+        timed: Indices of the photos with a capture time.
+        told: Phases by these times.
+
+    Returns:
+        The phases, by light for photos without a time, and the indices of photos whose time contradicts their
+        light. None if times and lights have little in common.
+    """
+    elevations = NOON - np.abs(told - NOON)
+    kept, agreement = _consistent_times(predictors[timed], elevations)
+    if agreement < _LEAST_AGREEMENT:
+        return None
+    right = timed[kept]
+    # Shadows tell the halves of the day apart, and times which of them is the morning: south of the tropics, the
+    # sun moves to the left.
+    if np.mean(rising[right] == (told[kept] < NOON)) < 0.5:
+        rising = ~rising
+    learned = np.minimum(_learn(predictors, elevations[kept], _RIDGE, rows=right), NOON)
+    phases = np.where(rising, learned, 180 - learned)
+    phases[timed] = told
+    return phases, timed[~kept]
 
 
 def _components(luminance: Float[np.ndarray, "P M"]) -> Float[np.ndarray, "P C"]:
@@ -185,15 +226,20 @@ def _is_morning(suns: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
 
 def _learn(
     axes: Float[np.ndarray, "P C"],
-    target: Float[np.ndarray, " P"],
+    target: Float[np.ndarray, " R"],
     ridge: float,
-    weights: np.ndarray | None = None,
+    weights: Float[np.ndarray, " R"] | None = None,
+    rows: Int[np.ndarray, " R"] | None = None,
 ) -> Float[np.ndarray, " P"]:
-    """Predictions for all photos by ridge regression of a target on the components."""
-    weights = np.ones(len(axes)) if weights is None else weights
-    middle = (weights @ target) / weights.sum()
-    gram = (axes * weights[:, None]).T @ axes / weights.sum() + ridge * np.eye(axes.shape[1])
-    return middle + axes @ np.linalg.solve(gram, axes.T @ (weights * (target - middle)) / weights.sum())
+    """Predictions for all photos by ridge regression of a target on the components, learned from some rows."""
+    known = axes if rows is None else axes[rows]
+    weights = np.ones(len(known)) if weights is None else weights
+    middle, centre = (weights @ target) / weights.sum(), (weights @ known) / weights.sum()
+    centred = known - centre
+    gram = (centred * weights[:, None]).T @ centred / weights.sum() + ridge * np.eye(axes.shape[1])
+    return middle + (axes - centre) @ np.linalg.solve(
+        gram, centred.T @ (weights * (target - middle)) / weights.sum()
+    )
 
 
 def _consistent_times(
@@ -212,9 +258,10 @@ def _consistent_times(
 
 def _cross_validated(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, " P"]) -> float:
     """Correlation between elevations and their leave-one-out predictions."""
-    own = np.einsum("pc,cd,pd->p", axes, np.linalg.inv(axes.T @ axes + 1e-9 * np.eye(axes.shape[1])), axes)
-    error = (heights - _learn(axes, heights, _RIDGE)) / np.maximum(1 - own - 1 / len(axes), 0.05)
-    predicted = heights - error
+    centred, count = axes - axes.mean(axis=0), len(axes)
+    inverse = np.linalg.inv(centred.T @ centred / count + _RIDGE * np.eye(axes.shape[1])) / count
+    own = np.einsum("pc,cd,pd->p", centred, inverse, centred) + 1 / count
+    predicted = heights - (heights - _learn(axes, heights, _RIDGE)) / (1 - own)
     if min(np.std(predicted), np.std(heights)) < 1e-9:
         return 0.0
     return float(np.corrcoef(predicted, heights)[0, 1])
@@ -223,20 +270,21 @@ def _cross_validated(axes: Float[np.ndarray, "P C"], heights: Float[np.ndarray, 
 def _day(
     names: list[str],
     axes: Float[np.ndarray, "P C"],
-    chosen: np.ndarray,
-    phases: Float[np.ndarray, " Q"],
-    left_out: dict[str, str],
-    *,
-    by_time: bool,
+    phases: Float[np.ndarray, " P"],
+    timed: Int[np.ndarray, " T"],
+    wrong: Int[np.ndarray, " W"],
 ) -> Day:
-    order = np.argsort(phases, kind="stable")
-    chosen, phases = chosen[order], phases[order]
-    keys = _smooth_keys(axes[chosen], phases)
+    """The day of photos with these phases, without those of wrong capture times."""
+    shown = np.setdiff1d(np.arange(len(names)), wrong)
+    order = shown[np.argsort(phases[shown], kind="stable")]
+    keys = _smooth_keys(axes[order], phases[order])
+    by_time = len(timed) > 0
     return Day(
-        {names[index]: round(float(phase), 2) for index, phase in zip(chosen, phases, strict=True)},
-        tuple(names[chosen[key]] for key in keys),
-        by_time,
-        left_out,
+        phases={names[index]: round(float(phases[index]), 2) for index in order},
+        keys=tuple(names[order[key]] for key in keys),
+        by_time=by_time,
+        untimed=tuple(names[index] for index in order if index not in timed) if by_time else (),
+        left_out={names[index]: "its capture time contradicts its light" for index in wrong},
     )
 
 

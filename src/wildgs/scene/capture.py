@@ -44,8 +44,23 @@ def carry_capture(source: Path, target: Path) -> None:
         return
     content = target.read_bytes()
     if content.startswith(_START) and len(block) <= _MOST_BYTES:
-        size = struct.pack(">H", len(block) + 2)
-        target.write_bytes(b"".join([_START, _EXIF_SEGMENT, size, block, content[len(_START) :]]))
+        target.write_bytes(with_exif(content, block))
+
+
+def with_exif(jpeg: bytes, block: bytes) -> bytes:
+    """Inserts an EXIF block before all other segments of a JPEG file, without encoding the pixels again.
+
+    Args:
+        jpeg: A JPEG file without an EXIF block.
+        block: As `PIL.Image.Exif.tobytes` returns it.
+
+    Raises:
+        ValueError: The file is no JPEG, or the block is longer than a segment.
+    """
+    if not jpeg.startswith(_START) or len(block) > _MOST_BYTES:
+        raise ValueError("an EXIF block must fit into one segment of a JPEG file")
+    size = struct.pack(">H", len(block) + 2)
+    return b"".join([_START, _EXIF_SEGMENT, size, block, jpeg[len(_START) :]])
 
 
 _TIME = "%Y:%m:%d %H:%M:%S"

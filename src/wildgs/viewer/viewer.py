@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from wildgs.errors import UserError
-from wildgs.exporters.page import choose_start
 from wildgs.files import printable
 from wildgs.model.gaussians import NEAR
 from wildgs.scene import View
+from wildgs.scene.start import choose_start
 from wildgs.viewer.cameras import pose_of
 from wildgs.viewer.config import ViewerConfig
 from wildgs.viewer.display import Paint, SplatDisplay
@@ -75,8 +75,7 @@ class Viewer:
         self._closing = threading.Event()
         self._lit_by: LightDesk | None = None
         self.gallery = Gallery(spread(subject.views, max(config.photos, 1)))
-        number, depth = choose_start([view.camera for view in subject.views], subject.scene.points)
-        start = subject.views[number]
+        start, depth = choose_start(subject.scene)
         self._set_start(start, max(depth, 10 * NEAR))
         self.display = SplatDisplay(server, subject, start.camera.position.detach().cpu())
         self._build(lights, status, videos, day)
