@@ -111,7 +111,7 @@ class ChunkedLayers(torch.autograd.Function):
                 by_weight[place] += delta.T @ before
                 by_bias[place] += delta.sum(0)
             by_rows[part] = deltas[0] @ first
-            if by_direct is not None:
+            if direct is not None and by_direct is not None:
                 by_rows[part].addmm_(gradient[part], direct)
                 by_direct.addmm_(gradient[part].T, rows[part])
         weights = [each for pair in zip(by_weight, by_bias, strict=True) for each in pair]

@@ -294,6 +294,7 @@ class WildGS(Method):
     ) -> Float[Tensor, "V K 3"]:
         """Spherical harmonics by the fusion network and the colour match."""
         common, local = embeddings.global_embedding, embeddings.local_embeddings
+        assert local is not None
         change, sky = embeddings.color_map, self.photo_match.sky(means, self._centre)
         which = None if sky is None else sky.which
         network_input = self._network_input(intrinsic)
@@ -331,12 +332,10 @@ class WildGS(Method):
         # Taken once: every further gather of a row has a scatter in the backward pass.
         means, intrinsic = (take_rows(self.gaussians.rows[name], rows) for name in ("means", "intrinsic"))
         regions = intrinsic.split([landmark, len(rows) - landmark])
-        embeddings = self._embedded(appearance, means)
-        harmonics = self.fusion.by_region(
-            embeddings.global_embedding,
-            embeddings.local_embeddings,
-            *(self._network_input(region) for region in regions),
-        )
+        assert appearance.global_embedding is not None
+        local = self.wrapping.local_embeddings(appearance.planes, means)
+        inputs = [self._network_input(region) for region in regions]
+        harmonics = self.fusion.by_region(appearance.global_embedding, local, *inputs)
         matched = bool(self.config.color_match and self.config.matched_loss)
         colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
         if matched:
