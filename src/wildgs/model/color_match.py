@@ -28,6 +28,11 @@ OUTLIER = 0.05
 LEAST_PIXELS = 64
 """Smallest number of pixels for a match."""
 
+PRIOR_ELEVATIONS = torch.linspace(-1, 1, 9)
+"""Sines of elevations at which an encoded photo's sky is assumed not to change, unless the photo shows it."""
+PRIOR_SHARE = 0.02
+"""Weight of this assumption relative to that of the photo's sky pixels."""
+
 ELEVATION_ORDERS = 2
 """Powers of the sine of the elevation in the sky's transform, since the sky is paler near the horizon."""
 SKY_COLUMNS = 4 + ELEVATION_ORDERS
@@ -55,6 +60,10 @@ def mapped(
     flat = rgb_to_sh0(matrix @ torch.full_like(change[:, 3], 0.5) + change[:, 3] + offset)
     turned = harmonics @ matrix.T
     return torch.cat([turned[:, :1] + flat.reshape(-1, 1, 3), turned[:, 1:]], dim=1)
+
+
+Region = tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels _"]]
+"""Weights of pixels, and the terms of a transform besides colour at them."""
 
 
 @torch.no_grad()
@@ -97,7 +106,34 @@ def match_photo(
     if sky is not None:
         elevated = torch.cat([ones, elevation_powers(sky.sine)], dim=-1)
         regions.append(((covered & sky.which).float(), elevated))
-    return torch.cat(_fitted(rendering.colors, photo, regions, training), dim=1)
+    colors = rendering.colors
+    if sky is not None and not training:
+        colors, photo, regions = _with_prior(colors, photo, regions)
+    return torch.cat(_fitted(colors, photo, regions, training), dim=1)
+
+
+def _with_prior(
+    render: Float[Tensor, "*pixels 3"], photo: Float[Tensor, "*pixels 3"], regions: Sequence[Region]
+) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], list[Region]]:
+    """Appends sky pixels of the mean colour at all elevations, where render and photo agree.
+
+    A photo from above shows no sky, but distant ground, which has the depth of the sky. Without these pixels, the
+    transform that matches it would be extrapolated to the sky.
+    """
+    colors, target = render.reshape(-1, 3), photo.reshape(-1, 3)
+    (weights, terms), (above, elevated) = ((w.reshape(-1), t.reshape(-1, t.shape[-1])) for w, t in regions)
+    count, total = len(PRIOR_ELEVATIONS), above.sum()
+    mean = ((above[:, None] * colors).sum(dim=0) / total.clamp_min(1)).expand(count, 3)
+    sines = PRIOR_ELEVATIONS.to(colors)
+    prior = torch.cat([torch.ones_like(sines)[:, None], elevation_powers(sines)], dim=-1)
+    extended = [
+        (
+            torch.cat([weights, weights.new_zeros(count)]),
+            torch.cat([terms, terms.new_zeros(count, terms.shape[1])]),
+        ),
+        (torch.cat([above, (PRIOR_SHARE / count * total).expand(count)]), torch.cat([elevated, prior])),
+    ]
+    return torch.cat([colors, mean]), torch.cat([target, mean]), extended
 
 
 def changed_harmonics(
@@ -130,7 +166,7 @@ def split_change(change: Float[Tensor, "3 M"], codes: int) -> tuple[Tensor, ...]
 def _fitted(
     render: Float[Tensor, "*pixels 3"],
     photo: Float[Tensor, "*pixels 3"],
-    regions: Sequence[tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels _"]]],
+    regions: Sequence[Region],
     training: bool,
 ) -> list[Float[Tensor, "3 _"]]:
     """Robust least squares of photo minus render on the render's colours and further terms.
