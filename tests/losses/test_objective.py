@@ -6,6 +6,7 @@ from wildgs.losses.objective import (
     ObjectiveConfig,
     depth_correlation,
     metric_error,
+    nearness,
     total_loss,
     visibility_regularizer,
 )
@@ -166,3 +167,13 @@ def test_metric_depth_takes_the_place_of_the_monocular_estimate() -> None:
     torch.testing.assert_close(both.depth, lower.depth)
     without = total_loss(config, 0.0, photo, photo, depth=2 * depth, metric_depth=metric)
     torch.testing.assert_close(without.total, 0.7 * without.depth + without.image)
+
+
+def test_depth_in_front_of_the_sky_is_penalised_by_its_nearness() -> None:
+    depth = torch.tensor([[1.0, 3.0], [8.0, 1.0]], requires_grad=True)
+    sky = torch.tensor([[True, True], [True, False]])
+    loss = nearness(depth, sky)
+    assert loss.item() == pytest.approx((0.75 + 0.25) / 4)
+    loss.backward()
+    assert depth.grad is not None
+    assert depth.grad.tolist() == [[pytest.approx(-0.0625), pytest.approx(-0.0625)], [0.0, 0.0]]

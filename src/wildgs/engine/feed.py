@@ -8,11 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from wildgs.devices import upload
 from wildgs.engine.team import Team
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
+from wildgs.priors.sky_pixels import find_sky_pixels
 from wildgs.scene import View
 from wildgs.scene.image_cache import AHEAD
 
@@ -76,7 +78,18 @@ class PhotoFeed:
         team: Team,
         device: torch.device,
         observations: Mapping[str, Float[Tensor, "_ 2"]] | None = None,
+        points: Float[Tensor, "P 3"] | None = None,
     ) -> None:
+        """Creates the feed.
+
+        Args:
+            views: Training photos.
+            sampler: Their order.
+            team: The processes that train.
+            device: Device of the training.
+            observations: Pixels of triangulated points by the photo's name.
+            points: Sparse points, for `sky`.
+        """
         self.views = views
         self.sampler = sampler
         self.team = team
@@ -85,6 +98,8 @@ class PhotoFeed:
         self._observations = {name: pixels.to(device) for name, pixels in (observations or {}).items()}
         self._unreadable: set[str] = set()
         self._cameras: dict[str, Camera] = {}
+        self._points = torch.zeros(0, 3) if points is None else points
+        self._sky: dict[str, Bool[Tensor, "_ _"]] = {}
 
     def next_view(self) -> View:
         """The next readable photo; starts decoding the following ones in the background.
@@ -142,6 +157,14 @@ class PhotoFeed:
     def observations(self, view: View) -> Float[Tensor, "K 2"] | None:
         """Pixels (x, y) of the photo's triangulated points, if known."""
         return self._observations.get(view.name)
+
+    def sky(self, view: View) -> Bool[Tensor, "H W"]:
+        """Pixels of the photo that certainly show sky; found once at low resolution."""
+        if view.name not in self._sky:
+            found = find_sky_pixels(view.read_photo(), view.camera, self._points)
+            self._sky[view.name] = found.to(self.device)
+        small = self._sky[view.name].float()[None, None]
+        return functional.interpolate(small, size=(view.camera.height, view.camera.width))[0, 0] > 0.5
 
     def camera(self, view: View) -> Camera:
         """The camera, cached on the device."""

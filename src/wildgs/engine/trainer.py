@@ -129,7 +129,9 @@ class Trainer:
         self.density = strategy(config.density, extent, len(method.gaussians), self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
-        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, observed_pixels(scene))
+        self.feed = PhotoFeed(
+            self.views, self.sampler, self.team, self.device, observed_pixels(scene), scene.points
+        )
         self.guard = StepGuard()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
@@ -188,7 +190,7 @@ class Trainer:
         output, losses = self._forward(view, photo, keep)
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
-            static = self._static_pixels(output, keep)
+            static = self._static_pixels(view, output, keep)
             seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, static)
             seen = self.density.before_backward(seen)
         skipped = self._report_marked()
@@ -233,13 +235,22 @@ class Trainer:
         return fault
 
     def _static_pixels(
-        self, output: TrainingOutput, keep: Bool[Tensor, "H W"] | None
+        self, view: View, output: TrainingOutput, keep: Bool[Tensor, "H W"] | None
     ) -> Bool[Tensor, "H W"] | None:
-        """Pixels that are neither transient nor masked by the user."""
-        if output.visibility is None:
-            return keep
-        static = output.visibility > self.config.density.min_visibility
-        return static if keep is None else static & keep
+        """Pixels that are neither transient nor masked by the user nor sky, which does not grow."""
+        static, sky = keep, self._sky(view)
+        if output.visibility is not None:
+            seen = output.visibility > self.config.density.min_visibility
+            static = seen if static is None else static & seen
+        if sky is not None:
+            static = ~sky if static is None else static & ~sky
+        return static
+
+    def _sky(self, view: View) -> Bool[Tensor, "H W"] | None:
+        """Pixels that certainly show sky; None for a method whose Gaussians may be in front of it."""
+        return (
+            self.feed.sky(view) if self.method.keeps_sky_free and self.config.objective.sky_weight else None
+        )
 
     def _report_marked(self) -> str | None:
         """Reports the previous step if the GPU, which has finished it by now, skipped it; returns the reason."""
@@ -270,6 +281,7 @@ class Trainer:
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
             metric_depth=self.feed.depth(view) if self.method.depth_supervised else None,
+            sky=self._sky(view),
             observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,

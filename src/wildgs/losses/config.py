@@ -22,6 +22,7 @@ class ObjectiveConfig:
             little weight.
         depth_weight: λ^D (paper: 0.05).
         metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
+        sky_weight: Weight of the loss on Gaussians in front of the sky. Not in the paper.
         mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
             'evidence': a robust measure of how transient a pixel is
             (`wildgs.losses.evidence.transient_evidence`). Neither changes the loss nor its gradient to the
@@ -36,6 +37,7 @@ class ObjectiveConfig:
     mask_power: float = 3.0
     depth_weight: float = 0.01
     metric_weight: float = 0.1
+    sky_weight: float = 0.1
     mask_gradient: Literal["evidence", "loss"] = "evidence"
     min_alpha: float = 0.5
 

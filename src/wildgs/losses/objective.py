@@ -22,7 +22,8 @@ class Losses:
         image: L^I.
         mask: L^M; 0 without a mask.
         depth: L^D plus the error against metric depth; 0 without depth maps.
-        total: ``L^I + λ^M L^M + λ^D L^D`` plus the weighted error against metric depth.
+        total: ``L^I + λ^M L^M + λ^D L^D`` plus the weighted error against metric depth and the loss in front of the
+            sky.
     """
 
     NAMES: ClassVar[tuple[str, ...]] = ("image", "mask", "depth", "total")
@@ -58,6 +59,7 @@ def total_loss(
     alpha: Float[Tensor, "H W"] | None = None,
     disparity: Float[Tensor, "H W"] | None = None,
     metric_depth: Float[Tensor, "H W"] | None = None,
+    sky: Bool[Tensor, "H W"] | None = None,
     observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
@@ -76,6 +78,7 @@ def total_loss(
         alpha: Accumulated alpha of the render; the depth loss ignores pixels below `min_alpha`.
         disparity: Monocular estimate, 0 where missing; None for a photo without it.
         metric_depth: Depth in world units, 0 where missing; used instead of the monocular estimate where it exists.
+        sky: Pixels that certainly show sky.
         observations: Pixels (x, y) at which the photo observes triangulated points, which are static.
         train_mask: Whether the mask gets a gradient (False in the pause after an opacity reset).
         mask_threshold: Threshold Th of static pixels for the depth loss.
@@ -106,6 +109,8 @@ def total_loss(
         if disparity is not None:
             correlation = depth_correlation(depth, disparity, selection)
             depth_term, total = depth_term + correlation, total + config.depth_weight * correlation
+    if depth is not None and sky is not None:
+        total = total + config.sky_weight * nearness(depth, sky)
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
 
 
@@ -138,6 +143,22 @@ def visibility_regularizer(visibility: Float[Tensor, "H W"]) -> Float[Tensor, ""
         0 where all is visible, 1 where all is hidden.
     """
     return (1 - visibility).square().mean()
+
+
+FAR = 4.0
+"""Depth from which nothing is in front of the sky, in median depths of the photos (units of the aligned frame)."""
+
+
+def nearness(depth: Float[Tensor, "H W"], sky: Bool[Tensor, "H W"]) -> Float[Tensor, ""]:
+    """Mean over all pixels of ``1 - depth / FAR`` where the photo shows sky and the render is nearer than `FAR`.
+
+    The rendered depth is that of the distant shell if nothing is in front of it.
+
+    Args:
+        depth: Rendered expected depth, units of the aligned frame.
+        sky: Pixels that show sky; gets no gradient.
+    """
+    return torch.where(sky, (1 - depth / FAR).clamp_min(0), 0.0).mean()
 
 
 OUTLYING = 0.1

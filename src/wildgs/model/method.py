@@ -40,6 +40,7 @@ class Method(nn.Module, ABC):
         local_size: Length of the local embeddings; 0 for a method without them.
         mask_threshold: Threshold Th: pixels with a higher visibility are static.
         depth_supervised: Whether the depth loss applies to this method.
+        keeps_sky_free: Whether Gaussians in front of the sky are penalised, since the method has a sky of its own.
     """
 
     name: ClassVar[str]
@@ -57,6 +58,7 @@ class Method(nn.Module, ABC):
     local_size: int = 0
     mask_threshold: float = 0.5
     depth_supervised: bool = False
+    keeps_sky_free: bool = False
 
     @property
     def map_columns(self) -> int:

@@ -66,6 +66,7 @@ class WildGS(Method):
         self.local_size = config.wrapping.local_size
         self.mask_threshold = config.mask_threshold
         self.depth_supervised = not self._lacks("depth")
+        self.keeps_sky_free = config.sky.points > 0
         self.parsing = Parsing(config.parsing, encoder)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
