@@ -37,7 +37,7 @@ class ObjectiveConfig:
     mask_power: float = 3.0
     depth_weight: float = 0.01
     metric_weight: float = 0.1
-    sky_weight: float = 0.1
+    sky_weight: float = 1.0
     mask_gradient: Literal["evidence", "loss"] = "evidence"
     min_alpha: float = 0.5
 
