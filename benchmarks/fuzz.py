@@ -22,7 +22,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -323,14 +323,17 @@ def _read_carried(folder: Path) -> object:
 
 def _read_exif(folder: Path) -> object:
     """As `wildgs sfm`, the viewer's uploads, `load_scene` and the order of a day read photos."""
-    from wildgs.light.sun import phase_of
+    from wildgs.light.sun import phases_of
     from wildgs.scene.capture import read_capture
     from wildgs.scene.images import read_photo
     from wildgs.sfm.upright import copy_upright
 
     _tolerate(lambda: read_photo(folder / "photo.jpg", max_pixels=10_000_000))
     capture = read_capture(folder / "photo.jpg")
-    assert capture is None or np.isfinite(phase_of(capture, (48.0, 2.0)))
+    if capture is not None:  # alone, and beside a photo that tells the place
+        placed = replace(capture, place=(48.0, 2.0))
+        for captures in ({"photo": capture}, {"photo": capture, "other": placed}):
+            assert np.isfinite(list(phases_of(captures).values())).all()
     (folder / "p").mkdir(exist_ok=True)
     shutil.copyfile(folder / "photo.jpg", folder / "p" / "photo.jpg")
     return copy_upright(folder / "p", folder / "copies", folder / "masks", max_pixels=10_000_000)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from wildgs.config import RunConfig
-from wildgs.engine.config import TrainConfig
+from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.library.day import find_day
 from wildgs.library.loaded import LoadedScene
 from wildgs.library.training import train
@@ -21,7 +21,8 @@ from wildgs.scene import load_scene
 def test_the_day_of_a_new_run_encodes_no_photo(
     landmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = RunConfig(landmark.resolve(), train=TrainConfig(steps=5))
+    density = DensityConfig(max_gaussians=2000)
+    config = RunConfig(landmark.resolve(), train=TrainConfig(steps=5, density=density))
     scene = load_scene(config.scene, config.data)
     trained = train(scene, config, output=tmp_path / "run")
     loaded = LoadedScene(load_run(tmp_path / "run"), trained.appearances)

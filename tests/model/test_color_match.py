@@ -187,3 +187,18 @@ def test_landmark_and_sky_are_matched_as_each_alone(training: bool, codes: int) 
     above = match_sky(render[:12], photo[:12], sine[:12], training)
     torch.testing.assert_close(found, torch.cat([own, above], dim=1), atol=1e-6, rtol=1e-5)
     assert int(which.sum()) == 12 * 30
+
+
+def test_ground_in_the_distance_does_not_colour_the_sky() -> None:
+    """A photo from above, whose distant pixels are dark green, is no reason for a dark green sky."""
+    render = 0.6 + 0.05 * torch.rand(24, 30, 3, generator=torch.Generator().manual_seed(0))
+    sine = torch.linspace(-0.2, -0.9, 24)[:, None].expand(24, 30)
+    photo = torch.tensor([0.1, 0.25, 0.1]).expand(24, 30, 3)
+    found = match_sky(render, photo, sine)
+
+    def matched(elevation: float) -> torch.Tensor:
+        colors, sines = torch.full((1, 1, 3), 0.62), torch.full((1, 1), elevation)
+        return (changed(colors, found[:, :4]) + elevation_powers(sines) @ found[:, 4:].T)[0, 0]
+
+    assert float((matched(-0.5) - photo[0, 0]).abs().max()) < 0.1
+    assert float((matched(0.6) - 0.62).abs().max()) < 0.5 * float((matched(-0.5) - 0.62).abs().max())

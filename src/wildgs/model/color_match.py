@@ -30,7 +30,7 @@ LEAST_PIXELS = 64
 
 PRIOR_ELEVATIONS = torch.linspace(-1, 1, 9)
 """Sines of elevations at which an encoded photo's sky is assumed not to change, unless the photo shows it."""
-PRIOR_SHARE = 0.02
+PRIOR_SHARE = 0.005
 """Weight of this assumption relative to that of the photo's sky pixels."""
 
 ELEVATION_ORDERS = 2
@@ -114,7 +114,9 @@ def match_photo(
 
 def _with_prior(
     render: Float[Tensor, "*pixels 3"], photo: Float[Tensor, "*pixels 3"], regions: Sequence[Region]
-) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"], list[Region]]:
+) -> tuple[
+    Float[Tensor, "P 3"], Float[Tensor, "P 3"], list[tuple[Float[Tensor, " P"], Float[Tensor, "P _"]]]
+]:
     """Appends sky pixels of the mean colour at all elevations, where render and photo agree.
 
     A photo from above shows no sky, but distant ground, which has the depth of the sky. Without these pixels, the

@@ -162,7 +162,7 @@ class Fusion(MixedModule):
     ) -> Float[Tensor, " H"]:
         """Contribution to the first layer of embeddings that are the same for all Gaussians."""
         by_local = self.first_rows.weight[:, : len(local_embedding)]
-        return self.first_global(global_embedding) + functional.linear(local_embedding, by_local)
+        return self.first_global(global_embedding) + functional.linear(local_embedding[None], by_local)[0]
 
     def _change(
         self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None

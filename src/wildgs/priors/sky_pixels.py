@@ -51,9 +51,10 @@ def find_sky_pixels(
     allowed = _is_smooth(image) & _is_above(camera) & _is_free(camera, points)
     # Continued beyond the image, so that regions keep its corners.
     opened = ndimage.binary_opening(np.pad(allowed, MARGIN, mode="edge"), iterations=MARGIN)
-    labels, count = ndimage.label(opened[MARGIN:-MARGIN, MARGIN:-MARGIN])
+    labels = np.empty(allowed.shape, np.int32)
+    ndimage.label(opened[MARGIN:-MARGIN, MARGIN:-MARGIN], output=labels)
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(count + 1))
+    areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(labels.max() + 1))
     chosen = [each for each in border if each and areas[each] >= LEAST_SHARE * labels.size]
     return torch.from_numpy(
         ndimage.binary_erosion(np.isin(labels, chosen), iterations=MARGIN, border_value=1)
@@ -84,4 +85,4 @@ def _is_free(camera: Camera, points: Float[Tensor, "P 3"]) -> np.ndarray:
     free[y.numpy(), x.numpy()] = False
     if free.all():
         return free
-    return ndimage.distance_transform_edt(free) > CLEARANCE * max(free.shape)
+    return np.asarray(ndimage.distance_transform_edt(free)) > CLEARANCE * max(free.shape)
