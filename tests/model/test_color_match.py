@@ -201,4 +201,4 @@ def test_ground_in_the_distance_does_not_colour_the_sky() -> None:
         return (changed(colors, found[:, :4]) + elevation_powers(sines) @ found[:, 4:].T)[0, 0]
 
     assert float((matched(-0.5) - photo[0, 0]).abs().max()) < 0.1
-    assert float((matched(0.6) - 0.62).abs().max()) < 0.5 * float((matched(-0.5) - 0.62).abs().max())
+    assert float((matched(0.6) - 0.62).abs().max()) < 0.65 * float((matched(-0.5) - 0.62).abs().max())

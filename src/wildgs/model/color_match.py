@@ -30,7 +30,7 @@ LEAST_PIXELS = 64
 
 PRIOR_ELEVATIONS = torch.linspace(-1, 1, 9)
 """Sines of elevations at which an encoded photo's sky is assumed not to change, unless the photo shows it."""
-PRIOR_SHARE = 0.005
+PRIOR_SHARE = 0.002
 """Weight of this assumption relative to that of the photo's sky pixels."""
 
 ELEVATION_ORDERS = 2
@@ -106,10 +106,11 @@ def match_photo(
     if sky is not None:
         elevated = torch.cat([ones, elevation_powers(sky.sine)], dim=-1)
         regions.append(((covered & sky.which).float(), elevated))
-    colors = rendering.colors
+    colors, fixed = rendering.colors, 0
     if sky is not None and not training:
         colors, photo, regions = _with_prior(colors, photo, regions)
-    return torch.cat(_fitted(colors, photo, regions, training), dim=1)
+        fixed = len(PRIOR_ELEVATIONS)
+    return torch.cat(_fitted(colors, photo, regions, training, fixed), dim=1)
 
 
 def _with_prior(
@@ -170,6 +171,7 @@ def _fitted(
     photo: Float[Tensor, "*pixels 3"],
     regions: Sequence[Region],
     training: bool,
+    fixed: int = 0,
 ) -> list[Float[Tensor, "3 _"]]:
     """Robust least squares of photo minus render on the render's colours and further terms.
 
@@ -184,6 +186,7 @@ def _fitted(
         photo: Colours of the photo.
         regions: For each region, weights of the pixels, and further terms, the first of which is 1.
         training: Whether A is diagonal.
+        fixed: Number of last pixels whose weights are not reduced, whatever their residual.
     """
     sizes = [further.shape[-1] for _, further in regions]
     weights = torch.stack([weight.reshape(-1) for weight, _ in regions])
@@ -210,7 +213,8 @@ def _fitted(
         change = torch.linalg.solve_ex(normal[..., :-own], normal[..., -own:]).result
         if round_ < rounds - 1:
             error = (residuals - terms @ change).abs().mean(dim=(1, 3))
-            trusted = base / (1 + (error / OUTLIER).square())
+            reduced = base / (1 + (error / OUTLIER).square())
+            trusted = torch.cat([reduced[:, : len(colors) - fixed], base[:, len(colors) - fixed :]], dim=1)
     if training:
         found = torch.cat([change[:, :, 0, 0].diag_embed(), change[:, :, 1:, 0]], dim=2)
     else:
