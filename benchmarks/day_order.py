@@ -1,8 +1,8 @@
 """Are lights in the order of the day? Kendall's tau of the demo's photos against the true directions of the sun.
 
-    python benchmarks/day_order.py wildgs-demo/wildgs                      with the demo's EXIF blocks, and without
-    python benchmarks/day_order.py wildgs-demo/wildgs --clocks             with all true hours in EXIF blocks
-    python benchmarks/day_order.py wildgs-demo/wildgs --clocks --wrong 5   five clocks 8 to 12 hours off
+    python -m benchmarks.day_order wildgs-demo/wildgs                      with the demo's EXIF blocks, and without
+    python -m benchmarks.day_order wildgs-demo/wildgs --clocks             with all true hours in EXIF blocks
+    python -m benchmarks.day_order wildgs-demo/wildgs --clocks --wrong 5   five clocks 8 to 12 hours off
 
 The run must be of the demo's scene, or of one that `demo_generator.photos.make_landmark` renders with another seed.
 By elevation, morning and evening are the same; by phase, the sun rises to 90 and sets to 180 degrees. The order

@@ -206,7 +206,10 @@ def plain_steps(trainers: dict[MethodName, Trainer], count: int) -> dict[MethodN
     """Milliseconds of steps, the methods taking turns."""
     seconds: dict[MethodName, list[float]] = defaultdict(list)
     on_cuda = any(trainer.device.type == "cuda" for trainer in trainers.values())
-    warm_up = 20 if on_cuda else min(2, count)  # until every shape of photo has its graph
+    # Until every photo has been seen, since features of photos are computed once and kept, and on CUDA until every
+    # shape of photo has its graph.
+    photos = max(len(trainer.views) for trainer in trainers.values())
+    warm_up = 20 if on_cuda else -(-photos // 2)
     for index in range(count + warm_up):
         for name, trainer in trainers.items():
             rhythm = trainer.config.schedule.mask_every

@@ -14,7 +14,7 @@ from wildgs import features
 PARTS = 128
 LEAST_ROWS = 64 * PARTS
 """Smallest number of rows for `SplitLinear`."""
-CHUNK = 8192
+CHUNK = 4096
 """Rows per chunk of `ChunkedLayers`: a chunk's activations stay in a core's cache."""
 
 
