@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import reprlib
 import types
@@ -15,6 +14,7 @@ from typing import Any, Literal
 import yaml
 import yaml.composer
 
+from wildgs.earlier_defaults import with_earlier_defaults
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.files import check_regular, written_aside
@@ -218,37 +218,6 @@ _MOVED_RATES = {name: name for name in ("intrinsic", "networks", "encoder", "sh0
 }
 """Entries of `train.optimizer` in earlier versions -> entries of `model.learning_rates` now."""
 
-_EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
-    ("model", "matched_loss"): ("color_match", 0.0),
-    ("model", "light_codes"): ("color_match", 0),
-    ("model", "light_components"): ("color_match", 0),
-    ("model", "local_embeddings"): ("wrapping", True),
-    ("model", "eps2d"): ("wrapping", 0.3),
-    ("model", "sky", "densify"): ("lowest", True),
-    ("model", "sky", "own_fusion"): ("lowest", False),
-    ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
-    ("train", "objective", "mask_weight_photos"): ("mask_weight_end", 0),
-    ("train", "objective", "mask_power"): ("mask_weight_end", 1.0),
-    ("train", "objective", "sky_weight"): ("mask_weight_end", 0.0),
-    ("train", "density", "min_visibility"): ("least_pixels", 0.5),
-    ("train", "schedule", "mask_every"): ("mask_pause", 1),
-    ("train", "schedule", "planes_every"): ("mask_pause", 1),
-    ("train", "density", "strategy"): ("split_scale", "classic"),
-}
-"""Entries that were added later: path -> (a sibling by which an older file is recognised, the older behaviour)."""
-
-
-def _with_earlier_defaults(plain: dict[Any, Any]) -> dict[Any, Any]:
-    """Adds missing entries to an earlier version's configuration, with values that keep its behaviour."""
-    plain = copy.deepcopy(plain)
-    for (*parents, name), (sibling, value) in _EARLIER_DEFAULTS.items():
-        entries: Any = plain
-        for parent in parents:
-            entries = entries.get(parent) if isinstance(entries, dict) else None
-        if isinstance(entries, dict) and sibling in entries:
-            entries.setdefault(name, value)
-    return plain
-
 
 def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
     """Converts the configuration of an earlier version's run to the current form.
@@ -256,7 +225,7 @@ def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
     Learning rates of a method's own parameters were entries of `train.optimizer`, every method had the default
     method's options, and `train.objective` repeated the mask threshold.
     """
-    plain = _with_earlier_defaults(plain)
+    plain = with_earlier_defaults(plain)
     known = _entries(config_type(_method_of(plain)))
     model = plain.get("model")
     if isinstance(model, dict):

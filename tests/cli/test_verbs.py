@@ -8,13 +8,15 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
 import yaml
 from PIL import Image
 
-from wildgs.cli import VERBS
+from wildgs.cli import VERBS, doctor
+from wildgs.errors import WildGSWarning
 from wildgs.scene import demo
 
 
@@ -24,6 +26,19 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: ")
     return lines[0]
+
+
+def test_a_warning_is_printed_once(wildgs, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also if its cause is met several times, as a folder that a verb reads more than once."""
+
+    def run(_: object) -> None:
+        for photos in (1, 1, 2, 1):
+            warnings.warn(f"{photos} unused", WildGSWarning, stacklevel=1)
+
+    monkeypatch.setattr(doctor, "run", run)
+    for _ in range(2):
+        wildgs("doctor")
+        assert capsys.readouterr().err.splitlines() == ["warning: 1 unused", "warning: 2 unused"]
 
 
 def test_train_leaves_a_run_folder(trained: Path) -> None:

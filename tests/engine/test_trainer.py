@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
-from wildgs.engine.config import DensityConfig
+from wildgs.engine.config import DensityConfig, Strategy
 from wildgs.engine.density import SeenView
 from wildgs.engine.density.control import ViewStatistics
 from wildgs.engine.density.relocation import RelocationDensity
@@ -117,13 +117,18 @@ def differences(expected: dict[str, torch.Tensor], got: dict[str, torch.Tensor])
     return [n for n in expected if n != "progress.seconds" and not torch.equal(expected[n], got[n])]
 
 
-@pytest.mark.parametrize("method", ["3dgs", "wildgs"])
+@pytest.mark.parametrize(("method", "strategy"), [("3dgs", None), ("wildgs", None), ("3dgs", "mcmc")])
 def test_a_resumed_run_ends_in_the_same_bits(
-    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path, method: MethodName
+    wall_scene: Scene,
+    tiny_model: WildGSConfig,
+    tmp_path: Path,
+    method: MethodName,
+    strategy: Strategy | None,
 ) -> None:
-    whole = trainer_for(wall_scene, tiny_model, 60, method, schedule=SCHEDULE)
+    density = DensityConfig(strategy=strategy, max_gaussians=700)
+    whole = trainer_for(wall_scene, tiny_model, 60, method, schedule=SCHEDULE, density=density)
     whole.run([lambda r: save_checkpoint(tmp_path, r.step, whole.state(), {}) if r.step == 35 else None])
-    again = trainer_for(wall_scene, tiny_model, 60, method, schedule=SCHEDULE)
+    again = trainer_for(wall_scene, tiny_model, 60, method, schedule=SCHEDULE, density=density)
     again.run()
     assert differences(whole.state(), again.state()) == [], "two undisturbed runs"
     checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])

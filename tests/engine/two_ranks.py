@@ -60,7 +60,7 @@ def found_in(trainer: Trainer, losses: list[Losses]) -> dict:
 def step_forward(trainer: Trainer, view: View) -> tuple[SeenView, Losses]:
     """A step up to its losses."""
     photo, keep = trainer.feed.photo(view)
-    output, losses = trainer._forward(view, photo, keep)
+    output, losses = trainer._forward(view, photo, keep, trainer._sky(view))
     seen = SeenView(output.projection, output.rendering.colors, output.painted, photo)
     return trainer.density.before_backward(seen), losses
 

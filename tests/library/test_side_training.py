@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.config import ExecutionConfig, RunConfig, write_config
 from wildgs.engine.config import TrainConfig
 from wildgs.library.side_training import training_beside
 from wildgs.runs import load_run
@@ -49,3 +53,46 @@ def test_one_thread_is_not_divided(config: RunConfig, tmp_path: Path) -> None:
     with training_beside(config, tmp_path / "run", ExecutionConfig(threads=1)) as (_, process):
         assert process is None
     assert not (tmp_path / "run").exists()
+
+
+PARENT = """
+import sys
+import time
+from pathlib import Path
+
+from wildgs.config import ExecutionConfig, read_config
+from wildgs.library.side_training import training_beside
+
+config, folder = map(Path, sys.argv[1:])
+with training_beside(read_config(config), folder, ExecutionConfig(threads=2)) as (_, process):
+    print(process.pid, flush=True)
+    time.sleep(300)
+"""
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # An orphan that has ended stays in the table of processes where nobody waits for it.
+    state = Path(f"/proc/{pid}/stat")
+    return not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by POSIX signals")
+def test_it_ends_when_its_parent_is_killed(config: RunConfig, tmp_path: Path) -> None:
+    write_config(tmp_path / "config.yaml", replace(config, train=TrainConfig(steps=1_000_000)))
+    run = tmp_path / "run"
+    command = [sys.executable, "-c", PARENT, str(tmp_path / "config.yaml"), str(run)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        deadline = time.monotonic() + 120
+        while not (run / "config.yaml").exists() and time.monotonic() < deadline:
+            time.sleep(0.2)
+        assert is_alive(child)
+        parent.send_signal(signal.SIGKILL)
+    while is_alive(child) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not is_alive(child)

@@ -172,8 +172,20 @@ def test_metric_depth_takes_the_place_of_the_monocular_estimate() -> None:
 def test_depth_in_front_of_the_sky_is_penalised_by_its_nearness() -> None:
     depth = torch.tensor([[1.0, 3.0], [8.0, 1.0]], requires_grad=True)
     sky = torch.tensor([[True, True], [True, False]])
-    loss = nearness(depth, sky)
+    loss = nearness(depth, sky, far=4.0)
     assert loss.item() == pytest.approx((0.75 + 0.25) / 4)
     loss.backward()
     assert depth.grad is not None
     assert depth.grad.tolist() == [[pytest.approx(-0.0625), pytest.approx(-0.0625)], [0.0, 0.0]]
+
+
+def test_pixels_that_the_user_masks_are_no_sky() -> None:
+    photo, depth = torch.zeros(16, 16, 3), torch.ones(16, 16)
+    sky, keep = torch.ones(16, 16, dtype=torch.bool), torch.ones(16, 16, dtype=torch.bool)
+    keep[:, :4] = False
+    config = ObjectiveConfig(sky_weight=2.0)
+    losses = [
+        total_loss(config, 0.0, photo, photo, depth=depth, sky=sky, sky_depth=4.0, keep=each)
+        for each in (None, keep, torch.zeros_like(keep))
+    ]
+    assert [each.total.item() for each in losses] == pytest.approx([1.5, 1.125, 0.0])

@@ -88,8 +88,8 @@ def test_colours_change_in_training_as_harmonics_do(points: int, light_codes: in
     means, centre = torch.randn(50, 3) * torch.linspace(0.1, 20, 50)[:, None], torch.zeros(3)
     colors, intrinsic = torch.rand(50, 3), torch.randn(50, 32)
     harmonics = ((colors - 0.5) / C0)[:, None]
-    expected = 0.5 + C0 * match.harmonics(harmonics, change, means, intrinsic, centre)[:, 0]
     sky = match.sky(means, centre)
+    expected = 0.5 + C0 * match.harmonics(harmonics, change, intrinsic, sky)[:, 0]
     above = torch.zeros(50, dtype=torch.bool) if sky is None else sky.which
     codes = match.light_codes(intrinsic[~above])
     ordered = torch.cat([colors[~above], colors[above]])

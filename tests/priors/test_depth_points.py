@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.memory_views import make_view, with_photos
 from wildgs.geometry.camera import Camera
-from wildgs.priors.depth_points import DepthPointsConfig, depth_points, fit_disparity
+from wildgs.priors.depth_points import DepthPointsConfig, depth_points, fit_disparity, known_depth
 from wildgs.scene import Alignment, Scene, View
 
 SIDE, WALL = 64, 2.0
@@ -105,6 +105,22 @@ def test_without_depth_priors_or_use_for_them_there_are_none(config: DepthPoints
     views = [with_photos(each, disparity=None) if config.points else each for each in scene().views]
     points, colors = depth_points(scene(views), config)
     assert points.shape == colors.shape == (0, 3)
+
+
+def test_depth_is_known_where_a_map_tells_it() -> None:
+    """From either kind of map; disparity of 0 means no estimate, as does what lies beyond all points."""
+    disparity = (0.3 / relief()).numpy()
+    disparity[:8], disparity[-8:] = 0, 0.3 / 50
+    codes = (disparity / disparity.max() * 65535).astype(np.uint16)
+    metric = np.zeros((SIDE, SIDE), np.float32)
+    metric[:4] = 1.0
+    made = scene()
+    known = known_depth(with_photos(made.views[0], disparity=codes, depth=metric), made.points)
+    assert known is not None
+    expected = torch.ones(SIDE, SIDE, dtype=torch.bool)
+    expected[4:8], expected[-8:] = False, False
+    assert torch.equal(known, expected)
+    assert known_depth(with_photos(made.views[0], disparity=None), made.points) is None
 
 
 def test_disparity_that_is_noise_is_passed_over() -> None:

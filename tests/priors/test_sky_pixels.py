@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from wildgs.geometry.camera import Camera
 from wildgs.priors.sky_pixels import find_sky_pixels
@@ -55,6 +57,15 @@ def test_what_carries_points_is_no_sky() -> None:
     assert bool(found[:30, -50:].all())
 
 
+def test_what_has_a_known_depth_is_no_sky() -> None:
+    """A ceiling on the left, of which a depth map tells where it is."""
+    known = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    known[:, : WIDTH // 2] = True
+    found = find_sky_pixels(photo(0.02, 0.8), camera(), NO_POINTS, known)
+    assert not bool(found[:, : WIDTH // 2].any())
+    assert bool(found[:40, WIDTH // 2 + 3 :].all())
+
+
 def test_points_behind_the_camera_do_not_matter() -> None:
     behind = torch.tensor([[0.0, -10.0, 3.0]]).repeat(50, 1) + 0.1 * torch.randn(50, 3)
     plain, same = (find_sky_pixels(photo(0.02, 0.8), camera(), points) for points in (NO_POINTS, behind))
@@ -66,3 +77,17 @@ def test_large_photos_are_reduced() -> None:
     found = find_sky_pixels(large, camera().resized(4 * WIDTH, 4 * HEIGHT), NO_POINTS)
     assert found.shape == (HEIGHT, WIDTH)
     assert bool(found[:40].all())
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    width=st.integers(1, 400), height=st.integers(1, 400), value=st.integers(0, 255), count=st.integers(0, 3)
+)
+def test_photos_of_any_shape_have_a_sky_of_their_shape(
+    width: int, height: int, value: int, count: int
+) -> None:
+    plain = torch.full((height, width, 3), value, dtype=torch.uint8)
+    points = torch.tensor([[0.0, 5.0, 1.0]]).repeat(count, 1)
+    found = find_sky_pixels(plain, camera().resized(width, height), points)
+    scale = min(1.0, 160 / max(width, height))
+    assert found.shape == (max(1, round(height * scale)), max(1, round(width * scale)))

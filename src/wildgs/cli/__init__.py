@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -110,7 +111,7 @@ def _run(verb: str, arguments: list[str]) -> None:
     showwarning = warnings.showwarning
     try:
         with warnings.catch_warnings(), processes.signals_as_interrupts():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _warning_printer()
             warnings.simplefilter("always", WildGSWarning)
             module.run(command)
     finally:
@@ -161,12 +162,21 @@ def _discard_output(stream: Any) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-    """Prints a `WildGSWarning` as one line on stderr and ignores the warnings of other libraries."""
-    if issubclass(category, WildGSWarning):
+def _warning_printer() -> Callable[..., None]:
+    """A `warnings.showwarning` that prints each `WildGSWarning` once, as one line on stderr, and no other warnings.
+
+    A verb may read the same folder several times.
+    """
+    printed: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         line = " ".join(str(message).split())
-        logger.warning(line)
-        _print_error(f"{_rank_prefix()}warning: {line}")
+        if issubclass(category, WildGSWarning) and line not in printed:
+            printed.add(line)
+            logger.warning(line)
+            _print_error(f"{_rank_prefix()}warning: {line}")
+
+    return show
 
 
 def _fail(message: str) -> None:

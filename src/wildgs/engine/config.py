@@ -75,7 +75,7 @@ class OptimizerConfig:
     batch_scaling: Literal["sqrt", "none"] = "sqrt"
 
 
-Strategy = Literal["classic", "absgrad", "relocation"]
+Strategy = Literal["classic", "absgrad", "relocation", "mcmc"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ class DensityConfig:
     Attributes:
         strategy: 'classic' (3DGS) clones and splits Gaussians with large view-space positional gradients;
             'absgrad' uses absolute gradients (AbsGS); 'relocation' splits the Gaussians that cover most of the
-            rendering error and prunes those that contribute least. Default: relocation for wildgs, else classic.
+            rendering error and prunes those that contribute least; 'mcmc' (3DGS-MCMC) relocates transparent
+            Gaussians, fills the budget and adds noise. Default: relocation for wildgs, else classic.
         grow_gradient: Densify Gaussians whose mean view-space gradient, in normalised device coordinates, exceeds
             this; absgrad uses four times this value.
         split_scale: Gaussians larger than this fraction of the scene extent are split; smaller ones are cloned.
@@ -103,6 +104,9 @@ class DensityConfig:
             the photos that see them).
         least_pixels: Strategy relocation: prune Gaussians that cover fewer pixels in every photo.
         min_visibility: Strategy relocation: ignore the error of pixels whose visibility M is not above this.
+        noise_lr: Strategy mcmc: noise on centres as a multiple of their learning rate.
+        opacity_reg: Strategy mcmc: weight of the mean opacity in the loss.
+        scale_reg: Strategy mcmc: weight of the mean scale, in units of the aligned frame, in the loss.
         max_gaussians: Upper bound on the number of Gaussians, initial ones included.
     """
 
@@ -119,6 +123,9 @@ class DensityConfig:
     grow_error: float = 0.02
     least_pixels: float = 1.0
     min_visibility: float = 0.8
+    noise_lr: float = 5e5
+    opacity_reg: float = 0.01
+    scale_reg: float = 0.01
     max_gaussians: int = 3_000_000
 
 

@@ -14,6 +14,7 @@ from wildgs.devices import upload
 from wildgs.engine.team import Team
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
+from wildgs.priors.depth_points import known_depth
 from wildgs.priors.sky_pixels import find_sky_pixels
 from wildgs.scene import View
 from wildgs.scene.image_cache import AHEAD
@@ -161,7 +162,8 @@ class PhotoFeed:
     def sky(self, view: View) -> Bool[Tensor, "H W"]:
         """Pixels of the photo that certainly show sky; found once at low resolution."""
         if view.name not in self._sky:
-            found = find_sky_pixels(view.read_photo(), view.camera, self._points)
+            known = known_depth(view, self._points)
+            found = find_sky_pixels(view.read_photo(), view.camera, self._points, known)
             self._sky[view.name] = found.to(self.device)
         small = self._sky[view.name].float()[None, None]
         return functional.interpolate(small, size=(view.camera.height, view.camera.width))[0, 0] > 0.5

@@ -97,6 +97,11 @@ class Optimizers:
         """Factor on every learning rate."""
         return self.photos**0.5 if self.config.batch_scaling == "sqrt" else 1.0
 
+    @property
+    def means_rate(self) -> float:
+        """Current learning rate of the centres of the Gaussians."""
+        return next(group["lr"] for group in self.rows.param_groups if group["name"] == "means")
+
     def set_progress(self, progress: float) -> None:
         """Sets all learning rates for a fraction of the run, 0 to 1."""
         for optimizer, rates in ((self.rows, self.row_rates), (self.networks, self.network_rates)):

@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float
@@ -187,13 +188,17 @@ class Trainer:
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
-        output, losses = self._forward(view, photo, keep)
+        sky = self._sky(view)
+        output, losses = self._forward(view, photo, keep, sky)
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
-            static = self._static_pixels(view, output, keep)
+            static = self._static_pixels(output, keep, sky)
             seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, static)
             seen = self.density.before_backward(seen)
         skipped = self._report_marked()
+        if self.density.perturbs:
+            penalty = self.density.regularizer(self.method.gaussians, self.method.growable())
+            losses = replace(losses, total=losses.total + penalty)
         losses.total.backward()
         losses = self.team.average(self.method.parameters(), losses)
         skipped = self._take(seen, losses) or skipped
@@ -215,19 +220,26 @@ class Trainer:
             taken=taken,
         )
 
+    def _step(self, faulty: Float[Tensor, ""] | None = None) -> None:
+        """Takes the optimisers' step and lets density control perturb the result."""
+        self.optimizers.step(faulty)
+        if self.density.perturbs:
+            growable = self.method.growable()
+            self.density.perturb(self.method.gaussians, self.optimizers.means_rate, self.generator, growable)
+
     def _take(self, seen: SeenView | None, losses: Losses) -> str | None:
         """Takes the optimisers' step if it is finite; returns why it was skipped, if already known."""
         if self.skips_on_device:
             faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
             if seen is not None:
                 self.density.gather(seen, self.team.pool, faulty == 0)
-            self.optimizers.step(faulty)
+            self._step(faulty)
             return None
         fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
         if fault is None:
             if seen is not None:
                 self.density.gather(seen, self.team.pool)
-            self.optimizers.step()
+            self._step()
         else:
             self.method.zero_grad(set_to_none=True)
             with self.team.propagate_errors():
@@ -235,22 +247,20 @@ class Trainer:
         return fault
 
     def _static_pixels(
-        self, view: View, output: TrainingOutput, keep: Bool[Tensor, "H W"] | None
+        self, output: TrainingOutput, keep: Bool[Tensor, "H W"] | None, sky: Bool[Tensor, "H W"] | None
     ) -> Bool[Tensor, "H W"] | None:
-        """Pixels that are neither transient nor masked by the user nor sky, which does not grow."""
-        static, sky = keep, self._sky(view)
+        """Pixels that are neither transient nor masked by the user nor sky, which does not grow; None for all."""
+        masks = [] if keep is None else [keep]
         if output.visibility is not None:
-            seen = output.visibility > self.config.density.min_visibility
-            static = seen if static is None else static & seen
+            masks.append(output.visibility > self.config.density.min_visibility)
         if sky is not None:
-            static = ~sky if static is None else static & ~sky
-        return static
+            masks.append(~sky)
+        return reduce(torch.logical_and, masks) if masks else None
 
     def _sky(self, view: View) -> Bool[Tensor, "H W"] | None:
-        """Pixels that certainly show sky; None for a method whose Gaussians may be in front of it."""
-        return (
-            self.feed.sky(view) if self.method.keeps_sky_free and self.config.objective.sky_weight else None
-        )
+        """Pixels that certainly show sky; None if Gaussians may be in front of it."""
+        used = self.method.sky_depth and self.config.objective.sky_weight
+        return self.feed.sky(view) if used else None
 
     def _report_marked(self) -> str | None:
         """Reports the previous step if the GPU, which has finished it by now, skipped it; returns the reason."""
@@ -262,7 +272,11 @@ class Trainer:
         return found[1]
 
     def _forward(
-        self, view: View, photo: Float[Tensor, "H W 3"], keep: Bool[Tensor, "H W"] | None
+        self,
+        view: View,
+        photo: Float[Tensor, "H W 3"],
+        keep: Bool[Tensor, "H W"] | None,
+        sky: Bool[Tensor, "H W"] | None,
     ) -> tuple[TrainingOutput, Losses]:
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         dropout = self.config.dropout
@@ -281,7 +295,8 @@ class Trainer:
             alpha=output.rendering.alpha,
             disparity=self.feed.disparity(view) if supervised else None,
             metric_depth=self.feed.depth(view) if self.method.depth_supervised else None,
-            sky=self._sky(view),
+            sky=sky,
+            sky_depth=self.method.sky_depth,
             observations=self.feed.observations(view),
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,

@@ -60,6 +60,7 @@ def total_loss(
     disparity: Float[Tensor, "H W"] | None = None,
     metric_depth: Float[Tensor, "H W"] | None = None,
     sky: Bool[Tensor, "H W"] | None = None,
+    sky_depth: float = 0.0,
     observations: Float[Tensor, "K 2"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
@@ -78,7 +79,8 @@ def total_loss(
         alpha: Accumulated alpha of the render; the depth loss ignores pixels below `min_alpha`.
         disparity: Monocular estimate, 0 where missing; None for a photo without it.
         metric_depth: Depth in world units, 0 where missing; used instead of the monocular estimate where it exists.
-        sky: Pixels that certainly show sky.
+        sky: Pixels that certainly show sky; those that the user's mask leaves out are ignored.
+        sky_depth: Rendered depth below which something is in front of the sky.
         observations: Pixels (x, y) at which the photo observes triangulated points, which are static.
         train_mask: Whether the mask gets a gradient (False in the pause after an opacity reset).
         mask_threshold: Threshold Th of static pixels for the depth loss.
@@ -110,7 +112,8 @@ def total_loss(
             correlation = depth_correlation(depth, disparity, selection)
             depth_term, total = depth_term + correlation, total + config.depth_weight * correlation
     if depth is not None and sky is not None:
-        total = total + config.sky_weight * nearness(depth, sky)
+        free = sky if keep is None else sky & keep
+        total = total + config.sky_weight * nearness(depth, free, sky_depth)
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
 
 
@@ -145,20 +148,17 @@ def visibility_regularizer(visibility: Float[Tensor, "H W"]) -> Float[Tensor, ""
     return (1 - visibility).square().mean()
 
 
-FAR = 4.0
-"""Depth from which nothing is in front of the sky, in median depths of the photos (units of the aligned frame)."""
-
-
-def nearness(depth: Float[Tensor, "H W"], sky: Bool[Tensor, "H W"]) -> Float[Tensor, ""]:
-    """Mean over all pixels of ``1 - depth / FAR`` where the photo shows sky and the render is nearer than `FAR`.
+def nearness(depth: Float[Tensor, "H W"], sky: Bool[Tensor, "H W"], far: float) -> Float[Tensor, ""]:
+    """Mean over all pixels of ``1 - depth / far`` where the photo shows sky and the render is nearer than `far`.
 
     The rendered depth is that of the distant shell if nothing is in front of it.
 
     Args:
         depth: Rendered expected depth, units of the aligned frame.
         sky: Pixels that show sky; gets no gradient.
+        far: Depth from which nothing is in front of the sky, in the same units.
     """
-    return torch.where(sky, (1 - depth / FAR).clamp_min(0), 0.0).mean()
+    return torch.where(sky, (1 - depth / far).clamp_min(0), 0.0).mean()
 
 
 OUTLYING = 0.1

@@ -112,10 +112,10 @@ class Fusion(MixedModule):
         """
         if self.sky is None:
             return self(global_embedding, local_embeddings, torch.cat([landmark, sky]))
-        parts = [self(global_embedding, local_embeddings[: len(landmark)], landmark)]
-        if len(sky):
-            parts.append(self.sky(global_embedding, _no_local(sky), sky))
-        return torch.cat(parts)
+        below = self(global_embedding, local_embeddings[: len(landmark)], landmark)
+        if not len(sky):
+            return below
+        return torch.cat([below, self.sky(global_embedding, _no_local(sky), sky)])
 
     def with_sky(
         self,

@@ -104,13 +104,14 @@ class ChunkedLayers(torch.autograd.Function):
         by_direct = None if direct is None else rows.new_zeros(direct.shape)
         for part in _chunks(len(rows)):
             x = rows[part].to(first.dtype)
-            deltas = [gradient[part].to(first.dtype)]
-            for activation, weight in ((two[part], last), (one[part], second)):
-                deltas.insert(0, torch.ops.aten.threshold_backward(deltas[0] @ weight, activation, 0))
-            for place, (delta, before) in enumerate(zip(deltas, (x, one[part], two[part]), strict=True)):
+            of_three = gradient[part].to(first.dtype)
+            of_two = torch.ops.aten.threshold_backward(of_three @ last, two[part], 0)
+            of_one = torch.ops.aten.threshold_backward(of_two @ second, one[part], 0)
+            layers = ((of_one, x), (of_two, one[part]), (of_three, two[part]))
+            for place, (delta, before) in enumerate(layers):
                 by_weight[place] += delta.T @ before
                 by_bias[place] += delta.sum(0)
-            by_rows[part] = deltas[0] @ first
+            by_rows[part] = of_one @ first
             if direct is not None and by_direct is not None:
                 by_rows[part].addmm_(gradient[part], direct)
                 by_direct.addmm_(gradient[part].T, rows[part])

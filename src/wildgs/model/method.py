@@ -40,7 +40,8 @@ class Method(nn.Module, ABC):
         local_size: Length of the local embeddings; 0 for a method without them.
         mask_threshold: Threshold Th: pixels with a higher visibility are static.
         depth_supervised: Whether the depth loss applies to this method.
-        keeps_sky_free: Whether Gaussians in front of the sky are penalised, since the method has a sky of its own.
+        sky_depth: Rendered depth below which something is in front of the sky, in units of the aligned frame; 0 for
+            a method without Gaussians of the sky, in which nothing is penalised.
     """
 
     name: ClassVar[str]
@@ -58,7 +59,7 @@ class Method(nn.Module, ABC):
     local_size: int = 0
     mask_threshold: float = 0.5
     depth_supervised: bool = False
-    keeps_sky_free: bool = False
+    sky_depth: float = 0.0
 
     @property
     def map_columns(self) -> int:

@@ -232,12 +232,18 @@ class PhotoMatch(nn.Module):
         self,
         harmonics: Float[Tensor, "V K 3"],
         change: Float[Tensor, "3 M"],
-        means: Float[Tensor, "V 3"],
         intrinsic: Float[Tensor, "V I"],
-        centre: Float[Tensor, " 3"],
+        sky: Sky | None,
     ) -> Float[Tensor, "V K 3"]:
-        """Applies a transform to spherical harmonics."""
-        return changed_harmonics(harmonics, change, self.sky(means, centre), self.light_codes(intrinsic))
+        """Applies a transform to spherical harmonics.
+
+        Args:
+            harmonics: Of the Gaussians, relative to grey.
+            change: From `find`.
+            intrinsic: Their intrinsic features.
+            sky: Which of them are sky; from `sky`.
+        """
+        return changed_harmonics(harmonics, change, sky, self.light_codes(intrinsic))
 
 
 def _resized(values: Float[Tensor, "H W *C"], height: int, width: int) -> Float[Tensor, "h w *C"]:

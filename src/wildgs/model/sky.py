@@ -17,6 +17,8 @@ from wildgs.model.config import SkyConfig
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 COLOR = 0.75
+SKY_SHARE = 0.4
+"""Rendered depth of the free sky, at least, as a fraction of the sphere's radius."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,14 @@ def find_sky(config: SkyConfig, points: Float[Tensor, "*batch 3"], centre: Float
     """
     if not config.points:
         return None
-    offsets = points - centre
-    distances = offsets.norm(dim=-1)
-    return Sky(distances > 0.5 * config.radius, offsets[..., 2] / distances.clamp_min(1e-6))
+    return Sky(is_sky(config, points, centre), sine_of_elevation(points, centre))
+
+
+def is_sky(
+    config: SkyConfig, points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]
+) -> Bool[Tensor, "*batch"]:
+    """Mask of the points farther from the centre than half of the sphere's radius."""
+    return (points - centre).norm(dim=-1) > 0.5 * config.radius
 
 
 def sine_of_elevation(

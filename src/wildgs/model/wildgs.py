@@ -29,6 +29,7 @@ from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
 from wildgs.model.photo_match import PhotoMatch, Sight
+from wildgs.model.sky import SKY_SHARE, is_sky
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
@@ -66,7 +67,7 @@ class WildGS(Method):
         self.local_size = config.wrapping.local_size
         self.mask_threshold = config.mask_threshold
         self.depth_supervised = not self._lacks("depth")
-        self.keeps_sky_free = config.sky.points > 0
+        self.sky_depth = SKY_SHARE * config.sky.radius if config.sky.points else 0.0
         self.parsing = Parsing(config.parsing, encoder)
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
@@ -116,9 +117,10 @@ class WildGS(Method):
         return None if sky is None else ~sky
 
     def sky(self) -> Bool[Tensor, " N"] | None:
-        """Gaussians far from the scene; see `wildgs.model.sky.find_sky`."""
-        sky = self.photo_match.sky(self.gaussians.means, self._centre)
-        return None if sky is None else sky.which
+        """Gaussians far from the scene; see `wildgs.model.sky.is_sky`."""
+        if not self.config.sky.points:
+            return None
+        return is_sky(self.config.sky, self.gaussians.means.detach(), self._centre)
 
     def row_rates(self) -> dict[str, LearningRate]:
         """Learning rate of f^in."""
@@ -302,7 +304,7 @@ class WildGS(Method):
         if change is None or change.shape[1] == 4:
             return self.fusion.with_sky(common, local, network_input, which, change)
         harmonics = self.fusion.with_sky(common, local, network_input, which)
-        return self.photo_match.harmonics(harmonics, change, means, intrinsic, self._centre)
+        return self.photo_match.harmonics(harmonics, change, intrinsic, sky)
 
     def _network_input(self, intrinsic: Float[Tensor, "V I"]) -> Float[Tensor, "V I"]:
         """f^in, or zeros in the ablation without it."""

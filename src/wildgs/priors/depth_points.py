@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -119,16 +120,43 @@ def _photo_depths(
     view: View, points: Float[Tensor, "P 3"], config: DepthPointsConfig, generator: torch.Generator
 ) -> Iterator[_PhotoDepth]:
     """Depth of a photo in the scene's scale: metric depth, and aligned disparity where metric depth is missing."""
-    metric, disparity = view.read_depth(), view.read_disparity()
+    metric, aligned = aligned_depth(view, points, generator)
     if metric is not None:
         yield _to_points(view, metric, METRIC_VOTES, config)
-    if disparity is None:
-        return
-    aligned = _align(view.camera, disparity, metric, points, generator)
     if aligned is not None:
-        yield _to_points(
-            view, aligned if metric is None else torch.where(metric > 0, 0.0, aligned), 1, config
-        )
+        yield _to_points(view, aligned, 1, config)
+
+
+def aligned_depth(
+    view: View, points: Float[Tensor, "P 3"], generator: torch.Generator
+) -> tuple[Float[Tensor, "H W"] | None, Float[Tensor, "H W"] | None]:
+    """Reads the depth maps of a photo.
+
+    Args:
+        view: The photo.
+        points: Sparse points, to which disparity is aligned.
+        generator: Random numbers for the fit.
+
+    Returns:
+        Metric depth, and disparity converted to depth where metric depth is missing, both in world units along the
+        camera's z axis and 0 where unknown; None for a map that does not exist or cannot be aligned.
+    """
+    metric, disparity = view.read_depth(), view.read_disparity()
+    aligned = None if disparity is None else _align(view.camera, disparity, metric, points, generator)
+    if aligned is not None and metric is not None:
+        aligned = torch.where(metric > 0, 0.0, aligned)
+    return metric, aligned
+
+
+def known_depth(view: View, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "H W"] | None:
+    """Pixels of which a depth map of the photo tells the depth; None without usable depth maps.
+
+    Args:
+        view: The photo.
+        points: Sparse points, to which disparity is aligned.
+    """
+    maps = [depth > 0 for depth in aligned_depth(view, points, torch.Generator()) if depth is not None]
+    return reduce(torch.logical_or, maps) if maps else None
 
 
 def _align(

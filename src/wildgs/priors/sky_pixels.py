@@ -25,12 +25,17 @@ CLEARANCE = 0.02
 """Distance from the image of any sparse point, as a fraction of the longer side."""
 MARGIN = 2
 """Pixels by which regions are eroded."""
+LEAST_KNOWN = 0.5
+"""Share of known depths from which a pixel of the reduced photo is no sky."""
 LEAST_SHARE = 0.01
 """Smallest area of a region as a fraction of the photo."""
 
 
 def find_sky_pixels(
-    photo: UInt8[Tensor, "H W 3"], camera: Camera, points: Float[Tensor, "P 3"]
+    photo: UInt8[Tensor, "H W 3"],
+    camera: Camera,
+    points: Float[Tensor, "P 3"],
+    known: Bool[Tensor, "H W"] | None = None,
 ) -> Bool[Tensor, "h w"]:
     """Pixels that certainly show sky: smooth regions above the horizon, at the border, without sparse points.
 
@@ -38,6 +43,7 @@ def find_sky_pixels(
         photo: RGB.
         camera: Its camera in the aligned frame, in which z points upwards.
         points: Sparse points of the scene; those behind other surfaces count as well.
+        known: Pixels of which the depth is known, which are no sky; None without depth maps.
 
     Returns:
         The mask, reduced to at most `SIDE` pixels.
@@ -45,10 +51,10 @@ def find_sky_pixels(
     scale = min(1.0, SIDE / max(photo.shape[:2]))
     height, width = (max(1, round(side * scale)) for side in photo.shape[:2])
     camera = camera.resized(width, height)
-    image = functional.interpolate(
-        photo.permute(2, 0, 1)[None].float() / 255, size=(height, width), mode="bilinear", antialias=True
-    )[0]
+    image = _reduced(photo.permute(2, 0, 1).float() / 255, height, width)
     allowed = _is_smooth(image) & _is_above(camera) & _is_free(camera, points)
+    if known is not None:
+        allowed &= (_reduced(known.float()[None], height, width)[0] < LEAST_KNOWN).numpy()
     # Continued beyond the image, so that regions keep its corners.
     opened = ndimage.binary_opening(np.pad(allowed, MARGIN, mode="edge"), iterations=MARGIN)
     labels = np.empty(allowed.shape, np.int32)
@@ -59,6 +65,10 @@ def find_sky_pixels(
     return torch.from_numpy(
         ndimage.binary_erosion(np.isin(labels, chosen), iterations=MARGIN, border_value=1)
     )
+
+
+def _reduced(image: Float[Tensor, "C H W"], height: int, width: int) -> Float[Tensor, "C h w"]:
+    return functional.interpolate(image[None], size=(height, width), mode="bilinear", antialias=True)[0]
 
 
 def _is_smooth(image: Float[Tensor, "3 h w"]) -> np.ndarray:

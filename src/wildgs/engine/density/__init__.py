@@ -2,12 +2,14 @@
 
 from wildgs.engine.density.classic import AbsGradDensity, ClassicDensity
 from wildgs.engine.density.control import DensityControl, DensityReport, SeenView, ViewStatistics
+from wildgs.engine.density.mcmc import McmcDensity
 from wildgs.engine.density.relocation import RelocationDensity
 
 STRATEGIES: dict[str, type[DensityControl]] = {
     "classic": ClassicDensity,
     "absgrad": AbsGradDensity,
     "relocation": RelocationDensity,
+    "mcmc": McmcDensity,
 }
 """Strategies by the names of `DensityConfig.strategy`."""
 
@@ -17,6 +19,7 @@ __all__ = [
     "ClassicDensity",
     "DensityControl",
     "DensityReport",
+    "McmcDensity",
     "RelocationDensity",
     "SeenView",
     "ViewStatistics",

@@ -77,6 +77,8 @@ class DensityControl(ABC):
     """Share of the training steps after which densification ends."""
     absgrad: bool = False
     """Whether the strategy needs `Projection.absgrad`."""
+    perturbs: bool = False
+    """Whether the strategy regularises the Gaussians and perturbs them after every step."""
 
     def __init__(
         self, config: DensityConfig, extent: float, num_gaussians: int, device: torch.device | str = "cpu"
@@ -115,6 +117,21 @@ class DensityControl(ABC):
     def before_backward(self, view: SeenView) -> SeenView:
         """Completes a view before the step's backward pass, which frees the graph; by default does nothing."""
         return view
+
+    def regularizer(
+        self, gaussians: Gaussians, growable: Bool[Tensor, "N"] | None = None
+    ) -> Float[Tensor, ""]:
+        """A term of the loss; called if `perturbs`, by default 0."""
+        return gaussians.means.new_zeros(())
+
+    def perturb(  # noqa: B027 - optional
+        self,
+        gaussians: Gaussians,
+        rate: float,
+        generator: torch.Generator,
+        growable: Bool[Tensor, "N"] | None = None,
+    ) -> None:
+        """Changes the Gaussians after every step; called if `perturbs`, by default does nothing."""
 
     @abstractmethod
     def measure(self, view: SeenView, sound: Bool[Tensor, ""] | None = None) -> ViewStatistics:
