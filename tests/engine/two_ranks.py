@@ -60,8 +60,10 @@ def found_in(trainer: Trainer, losses: list[Losses]) -> dict:
 def step_forward(trainer: Trainer, view: View) -> tuple[SeenView, Losses]:
     """A step up to its losses."""
     photo, keep = trainer.feed.photo(view)
-    output, losses = trainer._forward(view, photo, keep, trainer._sky(view))
-    seen = SeenView(output.projection, output.rendering.colors, output.painted, photo)
+    sky = trainer._sky(view)
+    output, losses = trainer._forward(view, photo, keep, sky)
+    static = trainer._static_pixels(output, keep, sky)
+    seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, static)
     return trainer.density.before_backward(seen), losses
 
 
