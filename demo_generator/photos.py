@@ -57,7 +57,7 @@ class SyntheticConfig:
 
 
 @dataclass(frozen=True)
-class _Place:
+class Place:
     """The landmark, its surroundings, and both together."""
 
     landmark: World
@@ -84,7 +84,7 @@ def make_landmark(
     config = config or SyntheticConfig()
     for folder in ("images", "depth", "truth/clean", "truth/masks"):
         (output / folder).mkdir(parents=True, exist_ok=True)
-    place = _build_place()
+    place = build_place()
     photos = []
     for index in range(config.photos):
         photos.append(_take_photo(index, place, config, output))
@@ -98,12 +98,12 @@ def make_landmark(
 
 def find_lights(config: SyntheticConfig) -> dict[str, Light]:
     """The true light of each photo, by its name in the scene."""
-    place = _build_place()
+    place = build_place()
     return {f"landmark_{i:02d}.jpg": _begin_photo(i, place, config)[1] for i in range(config.photos)}
 
 
 def _begin_photo(
-    index: int, place: _Place, config: SyntheticConfig
+    index: int, place: Place, config: SyntheticConfig
 ) -> tuple[Viewpoint, Light, np.random.Generator]:
     rng = np.random.default_rng([config.seed, 1, index])
     view = _choose_view(index, place, config, rng)
@@ -114,16 +114,17 @@ def _split(index: int, config: SyntheticConfig) -> str:
     return "test" if index % config.test_every == config.test_every // 2 else "train"
 
 
-def _build_place() -> _Place:
+def build_place() -> Place:
+    """The demo's place, the same for every configuration."""
     landmark, around, whole = Solids(), Solids(), Solids()
     add_landmark(landmark)
     add_surroundings(around, np.random.default_rng(_PLACE_SEED))
     add_landmark(whole)
     add_surroundings(whole, np.random.default_rng(_PLACE_SEED))
-    return _Place(landmark.build(), around.build(), whole.build(), lamp_positions())
+    return Place(landmark.build(), around.build(), whole.build(), lamp_positions())
 
 
-def _choose_view(index: int, place: _Place, config: SyntheticConfig, rng: np.random.Generator) -> Viewpoint:
+def _choose_view(index: int, place: Place, config: SyntheticConfig, rng: np.random.Generator) -> Viewpoint:
     """A random viewpoint along the arc from which the landmark is mostly visible."""
     share = (0.5 + index * _GOLDEN_RATIO) % 1.0
     best, best_share = None, -1.0
@@ -138,7 +139,7 @@ def _choose_view(index: int, place: _Place, config: SyntheticConfig, rng: np.ran
     return best
 
 
-def _take_photo(index: int, place: _Place, config: SyntheticConfig, output: Path) -> Photo:
+def _take_photo(index: int, place: Place, config: SyntheticConfig, output: Path) -> Photo:
     """Renders and writes one photo with its depth prior, mask and (for a test photo) clean truth."""
     view, light, rng = _begin_photo(index, place, config)
     visitors = draw_visitors(view, lambda x, y, radius: is_free(place.whole, x, y, radius), rng)
@@ -168,7 +169,7 @@ def _write_png(pixels: np.ndarray, file: Path) -> None:
 
 
 def _shoot(
-    place: _Place, people: World, light: Light, view: Viewpoint, config: SyntheticConfig, index: int
+    place: Place, people: World, light: Light, view: Viewpoint, config: SyntheticConfig, index: int
 ) -> Rendered:
     return render(place.whole, people, place.lamps, light, view, per_pixel=config.samples, seed=index)
 
