@@ -4,10 +4,10 @@
     wildgs depth SCENE --by stereo
     python benchmarks/stereo_accuracy.py SCENE
 
-`demo` ray casts the generated landmark without its passers-by from the demo's cameras, so the reference is exact. Of
-another scene, the reference is the disparity in `depth/*.png`, whose scale and shift are unknown and vary slowly over
-the photo: on each photo it is fitted to stereo with 5 x 5 control values of each. Errors of stereo that vary as slowly
-are therefore not seen.
+`demo` ray casts the generated landmark without its passers-by from the demo's cameras, so the reference is exact.
+Of another scene, the reference is the disparity in `depth/*.png`, whose scale and shift are unknown and vary slowly
+over the photo: on each photo it is fitted to stereo with 5 x 5 control values of each. Errors of stereo that vary
+as slowly are therefore not seen.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ def demo_pairs(root: Path) -> Iterator[tuple[Float[np.ndarray, "H W"], Float[np.
             continue
         viewmat, camera = image.viewmat.double().numpy(), image.camera
         rotation = np.ascontiguousarray(viewmat[:3, :3].T)
-        view = Viewpoint(-rotation @ viewmat[:3, 3], rotation, camera.focal_length_x, camera.width, camera.height)
+        view = Viewpoint(
+            -rotation @ viewmat[:3, 3], rotation, camera.focal_length_x, camera.width, camera.height
+        )
         shape = (view.focal, view.center, view.width, view.height)
         yield np.asarray(Image.open(file)), depth_and_kind(whole, nobody, view.position, rotation, *shape)[0]
 
@@ -80,7 +82,11 @@ def fitted(depth: Float[np.ndarray, "H W"], prior: Float[np.ndarray, "H W"]) -> 
     height, width = depth.shape
     controls = np.eye(CONTROLS**2, dtype=np.float32).reshape(-1, CONTROLS, CONTROLS)
     smooth = np.stack(
-        [np.asarray(Image.fromarray(one).resize((width, height), Image.Resampling.BICUBIC)) for one in controls], -1
+        [
+            np.asarray(Image.fromarray(one).resize((width, height), Image.Resampling.BICUBIC))
+            for one in controls
+        ],
+        -1,
     )
     design = np.concatenate([smooth * prior[..., None], smooth], axis=-1)
     both = (depth > 0) & (prior > 0)
@@ -110,7 +116,9 @@ def main(command: Command) -> None:
         complete.append(known.sum() / max(solid.sum(), 1))
         errors.append(np.abs(depth[known] / reference[known] - 1))
     error = np.concatenate(errors)
-    sky = np.mean([(depth[reference == 0] > 0).mean() for depth, reference in pairs if (reference == 0).any()])
+    sky = np.mean(
+        [(depth[reference == 0] > 0).mean() for depth, reference in pairs if (reference == 0).any()]
+    )
     print(
         f"{len(pairs)} photos: {np.mean(error < 0.02):.1%} of the estimates within 2%, {np.mean(error < 0.05):.1%}"
         f" within 5%, median error {np.median(error):.2%}; {np.mean(complete):.1%} of the solid pixels"
