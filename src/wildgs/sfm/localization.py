@@ -34,6 +34,9 @@ MATCH_RATIO = 0.85
 MAX_ERROR = 0.008
 """Largest reprojection error of an inlier, relative to the photo's longer side (8 pixels of 1,000)."""
 
+MAX_TRIALS = 10_000
+"""Upper bound on RANSAC trials, COLMAP's default."""
+
 REFINE_LENS = 60
 """Number of inliers from which distortion is estimated as well."""
 
@@ -141,6 +144,8 @@ def solve_pose(
     camera: Any,
     focal_known: bool,
     seed: int,
+    *,
+    max_trials: int = MAX_TRIALS,
 ) -> dict[str, Any] | None:
     """Estimates a pose; None if there is no plausible one.
 
@@ -153,6 +158,7 @@ def solve_pose(
     estimation.ransac.max_error = MAX_ERROR * max(camera.width, camera.height)
     estimation.ransac.random_seed = seed
     estimation.ransac.min_inlier_ratio = 0.02
+    estimation.ransac.max_num_trials = max_trials
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     refinement.refine_focal_length = True
     with quiet():

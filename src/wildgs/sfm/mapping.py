@@ -6,7 +6,7 @@ Source: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -81,13 +81,36 @@ def map_photos(
     return by_size(models.values())
 
 
-def continue_mapping(work: Workplace, model: Any, count: int, config: SfmConfig, progress: Progress) -> Any:
-    """Registers further photos in a model, with fewer inliers than in the first pass."""
+def continue_mapping(
+    work: Workplace,
+    model: Any,
+    count: int,
+    config: SfmConfig,
+    progress: Progress,
+    *,
+    constant_lenses: Collection[str] = (),
+) -> Any:
+    """Registers further photos in a model, with fewer inliers than in the first pass.
+
+    Args:
+        work: The workplace.
+        model: The model; it is not modified.
+        count: Number of all photos, for `progress`.
+        config: Options.
+        progress: Called for every photo.
+        constant_lenses: Working copies whose lenses keep the parameters in the database.
+
+    Returns:
+        The larger model, or `model` if no photo could be registered.
+    """
     start = work.fresh("start")
     model.write(start)
     options = _options(config)
     options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
     options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
+    if constant_lenses:
+        lenses = _lenses(work, constant_lenses)
+        options.constant_cameras = options.mapper.constant_cameras = lenses
     options.multiple_models = False
     models = pycolmap.incremental_mapping(
         work.database,
@@ -99,6 +122,11 @@ def continue_mapping(work: Workplace, model: Any, count: int, config: SfmConfig,
     )
     largest = by_size(models.values())
     return largest[0] if largest and largest[0].num_reg_images() >= model.num_reg_images() else model
+
+
+def _lenses(work: Workplace, names: Collection[str]) -> set[int]:
+    with closing(pycolmap.Database.open(work.database)) as database:
+        return {image.camera_id for image in database.read_all_images() if image.name in names}
 
 
 def _options(config: SfmConfig) -> Any:

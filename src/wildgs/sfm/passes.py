@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.enlarged import enlarge_small
 from wildgs.sfm.lenses import drop_impossible
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import (
@@ -73,11 +74,22 @@ def find_poses(
         work.save_models("first", models)
     passes: dict[str, PassName] = {}
     if config.second_chance:
+        if models:
+            drop_impossible(models[0])  # the next passes try these photos again
+            missing = set(missing_from(models[0], copies)) - set(crops)
+            enlarge_small(work, copies, missing, config.max_features)
         models, more = _try_again(work, copies, vlads, models, crops, passes, config, progress)
         pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
     if not models:
         return None
-    return Poses(models, pairing, passes, Findings(crops, drop_impossible(models[0])))
+    lenses = drop_impossible(models[0])
+    if lenses and config.second_chance:
+        models[0] = place_with_plain_lens(
+            work, copies, vlads, models[0], set(lenses), passes, config, progress
+        )
+        lenses |= drop_impossible(models[0])
+        lenses = {name: why for name, why in lenses.items() if name not in _names(models[0])}
+    return Poses(models, pairing, passes, Findings(crops, lenses))
 
 
 def _try_again(
@@ -137,6 +149,42 @@ def _place_by_points(
         if main.num_reg_images() == before.num_reg_images():
             break
     return [main, *models[1:]]
+
+
+def place_with_plain_lens(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    model: Any,
+    names: Collection[str],
+    passes: dict[str, PassName],
+    config: SfmConfig,
+    progress: Progress,
+) -> Any:
+    """Registers photos whose lens had become implausible with the focal length of their matches to points.
+
+    Their lenses have no distortion and stay as they are, because bundle adjustment made them implausible.
+
+    Args:
+        work: The workplace.
+        copies: All photos.
+        vlads: VLAD descriptors of all photos.
+        model: The model, without these photos.
+        names: Names of their working copies.
+        passes: Receives the pass of those registered.
+        config: Options.
+        progress: Called during matching and mapping.
+
+    Returns:
+        The model, with those of the photos for which a pose was found.
+    """
+    show = counter(progress, "matching to points")
+    if not match_to_points(work, copies, vlads, model, config.seed, show, only=names):
+        return model
+    after = continue_mapping(work, model, len(copies), config, progress, constant_lenses=names)
+    _note_new(model, after, passes, "second")
+    drop_unsure(after, work, passes)
+    return after
 
 
 def _more_pairs(

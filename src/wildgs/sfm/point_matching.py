@@ -9,8 +9,9 @@ matching", ECCV 2010.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
 from wildgs.progress import Counter
+from wildgs.sfm.consistent_matching import Features, Shapes, find_consistent_pose
 from wildgs.sfm.feature_index import FeatureIndex, nearest_points, select_matches
 from wildgs.sfm.localization import MIN_INLIERS, solve_pose
 from wildgs.sfm.mapping import find_registered, missing_from
@@ -40,6 +42,8 @@ def match_to_points(
     model: Any,
     seed: int,
     progress: Counter,
+    *,
+    only: Collection[str] | None = None,
 ) -> list[str]:
     """Writes inlier matches of photos without a pose to the database, as matches between photos.
 
@@ -50,16 +54,17 @@ def match_to_points(
         model: The current model.
         seed: Random seed of RANSAC.
         progress: Called with (photos tried, total number of photos).
+        only: Names of the working copies to match; None for all without a pose.
 
     Returns:
         Names of the working copies for which a pose was found.
     """
-    missing = missing_from(model, copies)
+    missing = [row for row in missing_from(model, copies) if only is None or copies[row].work_name in only]
     found = []
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
         placed = [row for row, copy in enumerate(copies) if find_registered(model, copy) is not None]
-        observed = [_observed(database, find_registered(model, copies[row])) for row in placed]
+        observed = [_observed(database, model, find_registered(model, copies[row])) for row in placed]
         for done, row in enumerate(missing):
             progress(done, len(missing))
             image_id = ids[row]
@@ -74,49 +79,92 @@ def match_to_points(
     return found
 
 
-Observed = tuple[UInt8[np.ndarray, "_ 128"], Int64[np.ndarray, " _"]]
-"""Descriptors of an image's features that observe points, and the points' ids."""
+@dataclass(frozen=True)
+class _Observed:
+    """An image's features that observe points.
+
+    Attributes:
+        descriptors: Their descriptors.
+        points: Ids of the points.
+        shapes: Their orientations, and sizes in world units.
+    """
+
+    descriptors: UInt8[np.ndarray, "_ 128"]
+    points: Int64[np.ndarray, " _"]
+    shapes: Shapes
 
 
-def _observed(database: Any, image: Any) -> Observed:
+@dataclass(frozen=True)
+class _Indexed:
+    """Points that some images observe.
+
+    Attributes:
+        index: Their feature index.
+        ids: The points' ids.
+        shapes: Shapes of the features in the index.
+    """
+
+    index: FeatureIndex
+    ids: Int64[np.ndarray, " P"]
+    shapes: Shapes
+
+
+def _observed(database: Any, model: Any, image: Any) -> _Observed:
     rows = image.get_observation_point2D_idxs()
-    points = image.get_observation_points2D()
-    descriptors = np.array(database.read_descriptors(image.image_id).data[rows])
-    return descriptors, np.array([point.point3D_id for point in points], np.int64)
+    ids = np.array([point.point3D_id for point in image.get_observation_points2D()], np.int64)
+    pose = image.cam_from_world()
+    places = np.array([model.point3D(point).xyz for point in ids], np.float64).reshape(-1, 3)
+    depth = (places @ pose.rotation.matrix().T + pose.translation)[:, 2]
+    flat = Shapes.of(database.read_keypoints(image.image_id)[rows])
+    shapes = Shapes(flat.angles, flat.sizes * np.maximum(depth, 1e-9) / image.camera.mean_focal_length())
+    return _Observed(np.array(database.read_descriptors(image.image_id).data[rows]), ids, shapes)
 
 
-def _index_points(model: Any, observed: Sequence[Observed]) -> tuple[FeatureIndex, Int64[np.ndarray, " P"]]:
-    """Feature index of the points that some images observe, and the points' ids."""
-    unique, owners = np.unique(np.concatenate([ids for _, ids in observed]), return_inverse=True)
+def _index_points(model: Any, observed: Sequence[_Observed]) -> _Indexed:
+    unique, owners = np.unique(np.concatenate([each.points for each in observed]), return_inverse=True)
     places = np.array([model.point3D(point).xyz for point in unique], np.float64).reshape(-1, 3)
-    descriptors = np.concatenate([descriptors for descriptors, _ in observed])
-    return FeatureIndex(descriptors, owners.astype(np.int64), places), unique
+    descriptors = np.concatenate([each.descriptors for each in observed])
+    angles, sizes = (
+        np.concatenate([getattr(each.shapes, name) for each in observed]) for name in ("angles", "sizes")
+    )
+    return _Indexed(FeatureIndex(descriptors, owners.astype(np.int64), places), unique, Shapes(angles, sizes))
 
 
 def _solve_photo(
-    database: Any, image_id: int, seen: tuple[FeatureIndex, Int64[np.ndarray, " P"]], seed: int
+    database: Any, image_id: int, seen: _Indexed, seed: int
 ) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]] | None:
     """Features and ids of the inlier points of a pose; None without a reliable pose.
 
     The pose's focal length is written to the camera in the database, as the initial value for mapping.
     """
-    index, point_ids = seen
-    descriptors = np.array(database.read_descriptors(image_id).data)
-    keypoints = database.read_keypoints(image_id)[:, :2].astype(np.float64)
+    index = seen.index
+    keypoints = database.read_keypoints(image_id)
+    features = Features(
+        np.array(database.read_descriptors(image_id).data),
+        keypoints[:, :2].astype(np.float64),
+        Shapes.of(keypoints),
+    )
     stored = database.read_camera(database.read_image(image_id).camera_id)
-    nearest = nearest_points(descriptors, index)
+    nearest = nearest_points(features.descriptors, index)
     for ratio in RATIOS:
-        features, points = select_matches(*nearest, ratio)
+        matched, points = select_matches(*nearest, ratio)
         camera = pycolmap.Camera(stored.todict())
         answer = solve_pose(
-            keypoints[features], index.points[points], camera, stored.has_prior_focal_length, seed
+            features.pixels[matched], index.points[points], camera, stored.has_prior_focal_length, seed
         )
         if answer is not None and answer["num_inliers"] >= MIN_INLIERS:
-            camera.params = [*camera.params[:3], 0.0]
-            database.update_camera(camera)
             kept = np.asarray(answer["inlier_mask"])
-            return features[kept], point_ids[points[kept]]
-    return None
+            return _believe(database, camera, matched[kept], seen.ids[points[kept]])
+    pose = find_consistent_pose(features, index, seen.shapes, stored, seed)
+    return None if pose is None else _believe(database, pose.camera, pose.features, seen.ids[pose.points])
+
+
+def _believe(
+    database: Any, camera: Any, features: Int64[np.ndarray, " M"], points: Int64[np.ndarray, " M"]
+) -> tuple[Int64[np.ndarray, " M"], Int64[np.ndarray, " M"]]:
+    camera.params = [*camera.params[:3], 0.0]
+    database.update_camera(camera)
+    return features, points
 
 
 def _write_matches(
