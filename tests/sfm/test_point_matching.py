@@ -2,34 +2,18 @@
 
 import numpy as np
 import pycolmap
-import pytest
 from PIL import Image
 
+from tests.sfm.conftest import LOST
 from wildgs.progress import silent
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import continue_mapping, map_photos, missing_from
 from wildgs.sfm.match_pictures import SIDE, draw_matches, write_match_pictures
-from wildgs.sfm.matching import describe_photos, extract, forget_pairs, image_ids, match, verified_pairs
+from wildgs.sfm.matching import describe_photos, image_ids, verified_pairs
 from wildgs.sfm.placement import Findings, failures
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
-
-LOST = 5
-
-
-@pytest.fixture(scope="module")
-def matched(corner, tmp_path_factory: pytest.TempPathFactory) -> tuple[Workplace, list[WorkingCopy]]:
-    work = Workplace(tmp_path_factory.mktemp("work"))
-    work.images.mkdir()
-    copies = []
-    for number, pixels in enumerate(corner[0]):
-        copies.append(WorkingCopy(f"{number}.jpg", f"{number:06d}.jpg", f"{number}.jpg", False))
-        Image.fromarray(pixels).save(work.images / copies[-1].work_name, quality=95)
-    extract(work, copies, SfmConfig(), silent)
-    match(work, copies, describe_photos(work, copies, 0), SfmConfig(), silent)
-    forget_pairs(work, copies, [(other, LOST) for other in range(LOST) if other != 2])
-    return work, copies
 
 
 def test_photos_are_numbered_in_order_by_any_number_of_threads(

@@ -1,12 +1,12 @@
 """Matches features of a photo to points by weak geometric consistency and then guided by the pose found.
 
 Lowe's ratio test rejects most correct matches of photos that differ much from those of the model, because repeated
-architecture has similar descriptors. Without the test, nine of ten matches are wrong, too many for RANSAC. But correct
-matches agree on the rotation and the scale of the photo, since SIFT features have an orientation and a size. Those
-that do not agree with the majority are left out (weak geometric consistency; Jégou, Douze and Schmid, "Hamming
-embedding and weak geometric consistency for large scale image search", ECCV 2008). If a pose is found, features near
-the projected points are matched again (guided matching). A pose is believed if it has many more of these matches than
-the same pose with other points at the same places, which measures chance.
+architecture has similar descriptors. Without the test, nine of ten matches are wrong, too many for RANSAC. But
+correct matches agree on the rotation and the scale of the photo, since SIFT features have an orientation and a
+size. Those that do not agree with the majority are left out (weak geometric consistency; Jégou, Douze and Schmid,
+"Hamming embedding and weak geometric consistency for large scale image search", ECCV 2008). If a pose is found,
+features near the projected points are matched again (guided matching). A pose is believed if it has many more of
+these matches than the same pose with other points at the same places, which measures chance.
 """
 
 from __future__ import annotations
