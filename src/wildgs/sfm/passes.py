@@ -76,8 +76,10 @@ def find_poses(
     if config.second_chance:
         if models:
             drop_impossible(models[0])  # the next passes try these photos again
-            missing = set(missing_from(models[0], copies)) - set(crops)
-            enlarge_small(work, copies, missing, config.max_features)
+            if not work.is_done("enlarged"):
+                missing = set(missing_from(models[0], copies)) - set(crops)
+                enlarge_small(work, copies, missing, config.max_features)
+                work.set_done("enlarged")
         models, more = _try_again(work, copies, vlads, models, crops, passes, config, progress)
         pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
     if not models:
