@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pycolmap
 
 from tests.sfm.conftest import LOST
@@ -5,8 +7,8 @@ from wildgs.progress import silent
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
-from wildgs.sfm.passes import place_with_plain_lens
-from wildgs.sfm.placement import PassName
+from wildgs.sfm.passes import drop_unsure, place_with_plain_lens
+from wildgs.sfm.placement import NEIGHBOUR_POINTS, PassName, count_neighbours
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -36,3 +38,23 @@ def test_other_photos_are_not_tried(matched: tuple[Workplace, list[WorkingCopy]]
     model = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
     vlads = describe_photos(work, copies, 0)
     assert place_with_plain_lens(work, copies, vlads, model, {"no.jpg"}, {}, SfmConfig(), silent) is model
+
+
+def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig = 10, 1
+    work = Workplace(tmp_path)
+    with pycolmap.Database.open(work.database) as database:
+        model = pycolmap.synthesize_dataset(options, database)
+    first, lonely, late = (model.image(i) for i in model.reg_image_ids()[:3])
+    for image in (first, lonely):  # a few points are left, each seen by other photos
+        rows = image.get_observation_point2D_idxs()
+        for row in rows[NEIGHBOUR_POINTS - 1 :]:
+            model.delete_observation(image.image_id, row)
+        assert count_neighbours(model, image) == 0
+    assert count_neighbours(model, late) > 0
+    drop_unsure(model, work, {lonely.name: "third", late.name: "second"})
+    registered = {model.image(i).name for i in model.reg_image_ids()}
+    assert lonely.name not in registered
+    assert {first.name, late.name} <= registered, "photos of the first pass are kept"

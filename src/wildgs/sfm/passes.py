@@ -25,7 +25,7 @@ from wildgs.sfm.mapping import (
 )
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
 from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, friends_of_friends
-from wildgs.sfm.placement import Findings, PassName
+from wildgs.sfm.placement import Findings, PassName, count_neighbours
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -223,9 +223,15 @@ def _note_new(before: Any, after: Any, passes: dict[str, PassName], name: PassNa
 
 
 def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> None:
-    """Removes photos registered by a later pass with too few points or contradicted by most of their matches."""
+    """Removes photos registered by a later pass whose poses are not reliable.
+
+    They have too few points, are contradicted by most of their matches, or share few points with every other photo.
+    Repeated architecture, like the sides of an octagonal tower, gives points scattered over many photos.
+    """
     doubtful = find_doubtful(model, work.database, {name: name for name in _names(model)})
     for image_id in list(model.reg_image_ids()):
         image = model.image(image_id)
-        if image.name in passes and (image.name in doubtful or image.num_points3D < LEAST_POINTS):
+        if image.name not in passes:
+            continue
+        if image.name in doubtful or image.num_points3D < LEAST_POINTS or not count_neighbours(model, image):
             model.deregister_frame(image.frame_id)

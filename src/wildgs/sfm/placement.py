@@ -53,22 +53,25 @@ def placements(
         image = find_registered(model, copy)
         if image is None:
             continue
-        shared: Counter[int] = Counter()
         errors = []
         for observation in image.get_observation_points2D():
-            point = model.point3D(observation.point3D_id)
-            projected = image.project_point(point.xyz)
+            projected = image.project_point(model.point3D(observation.point3D_id).xyz)
             if projected is not None:
                 errors.append(float(np.linalg.norm(projected - observation.xy)))
-            shared.update({element.image_id for element in point.track.elements})
-        neighbours = sum(
-            count >= NEIGHBOUR_POINTS for other, count in shared.items() if other != image.image_id
-        )
         error = float(np.mean(errors)) if errors else 0.0
-        result[copy.scene_name] = Placement(
-            passes.get(copy.work_name, "first"), image.num_points3D, round(error, 3), neighbours
-        )
+        placed_by, neighbours = passes.get(copy.work_name, "first"), count_neighbours(model, image)
+        result[copy.scene_name] = Placement(placed_by, image.num_points3D, round(error, 3), neighbours)
     return result
+
+
+def count_neighbours(model: Any, image: Any) -> int:
+    """Number of photos that share at least `NEIGHBOUR_POINTS` points with an image of a model."""
+    shared: Counter[int] = Counter()
+    for observation in image.get_observation_points2D():
+        track = model.point3D(observation.point3D_id).track
+        shared.update({element.image_id for element in track.elements})
+    del shared[image.image_id]
+    return sum(count >= NEIGHBOUR_POINTS for count in shared.values())
 
 
 @dataclass(frozen=True)
