@@ -60,7 +60,6 @@ _PAPER: dict[str, Any] = {
     "train.density.prune_by_distance": False,
     "train.density.prune_reach": 0.0,
     "train.density.reset_unseen": True,
-    "train.dropout.rate": 0.0,
 }
 """Switches off the additions of the default configuration and sets the paper's values."""
 _PRINTED: dict[str, Any] = {

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from wildgs.config import RunConfig
 from wildgs.model.config import DropoutConfig
 from wildgs.model.dropout import opacity_factors
-from wildgs.presets import with_preset
 
 
 def test_it_grows_with_training_and_is_off_where_photos_are_many() -> None:
@@ -17,12 +15,6 @@ def test_it_grows_with_training_and_is_off_where_photos_are_many() -> None:
     assert config.rate_at(1.0, 10) == pytest.approx(0.16)
     assert config.rate_at(0.5, 10) == pytest.approx(0.08)
     assert config.rate_at(1.0, 50) == config.rate_at(1.0, 500) == 0.0
-
-
-def test_presets_of_the_paper_drop_nothing() -> None:
-    assert RunConfig().train.dropout.rate > 0
-    for name in ("paper", "paper-mended"):
-        assert with_preset(RunConfig(), name).train.dropout.rate == 0
 
 
 def test_runs_of_neighbours_are_left_out_and_opacity_stays_in_the_mean() -> None:

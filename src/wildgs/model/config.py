@@ -302,7 +302,7 @@ class DropoutConfig:
         neighbours: Number of neighbouring Gaussians that are dropped together.
     """
 
-    rate: float = 0.2
+    rate: float = 0.0
     photos: int = 50
     neighbours: int = 8
 
