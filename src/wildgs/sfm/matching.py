@@ -18,6 +18,7 @@ from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.crops import CANDIDATE_LIKENESS, find_crops
 from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, choose_pairs, vlad_descriptors
 from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.watermarks import remove_captions
 from wildgs.sfm.workplace import Workplace
 
 EXTRACTION_BATCH = 16
@@ -152,8 +153,9 @@ def match_pairs(
 ) -> None:
     """Matches pairs and verifies the matches, except those already in the database.
 
-    Matches at the same pixel of both photos are left out, because they are watermarks and captions of agencies:
-    photos of different views were registered at one place by them.
+    Matches at the same pixel of both photos are left out, and those at the same place of their margins
+    (`wildgs.sfm.watermarks`), because they are watermarks and captions of agencies: photos of different views were
+    registered at one place by them.
 
     Args:
         work: The workplace; its database contains the features, and the matches are written to it.
@@ -186,6 +188,11 @@ def match_pairs(
             pairing_options=pycolmap.ImportedPairingOptions(match_list_path=str(lists)),
             verification_options=verification,
         )
+        if not keep_stationary:
+            with closing(pycolmap.Database.open(work.database)) as database:
+                ids = image_ids(database, copies)
+                known = [(ids[a], ids[b]) for a, b in chunk]
+                remove_captions(database, [(a, b) for a, b in known if a and b], verification)
     if ordered:
         progress(len(ordered), len(ordered))
 
