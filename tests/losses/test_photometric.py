@@ -347,3 +347,32 @@ def test_proof_shows_what_evidence_would_hide():
     gradient = visibility.grad[22:38]
     assert bool((gradient[:, 20:26] == -PROOF / 3600).all())
     assert float(gradient[:, 27:33].mean()) > 0.1 / 3600
+
+
+def lit_wall(surroundings: float, wall: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor]:
+    """A photo with a wall of one colour, and a render of the same brightness as its surroundings with texture."""
+    photo = torch.full((120, 160, 3), surroundings)
+    photo[40:80, 40:120] = torch.tensor(wall)
+    texture = 0.1 * torch.rand(120, 160, 1, generator=torch.Generator().manual_seed(0))
+    return photo, torch.full_like(photo, max(surroundings, 0.1)) + texture
+
+
+def test_a_floodlit_wall_at_night_is_not_transient():
+    photo, render = lit_wall(0.05, (1.0, 0.9, 0.6))
+    assert transient_evidence(photo, render)[45:75, 45:115].max() < 0.01
+
+
+def test_bright_objects_by_day_and_dark_ones_at_night_are_transient():
+    by_day, render = lit_wall(0.4, (1.0, 0.9, 0.2))
+    assert transient_evidence(by_day, render)[45:75, 45:115].min() > 0.2
+    at_night = torch.full((120, 160, 3), 0.05)
+    wall = 0.05 + 0.6 * torch.rand(120, 160, 1, generator=torch.Generator().manual_seed(0)).expand(-1, -1, 3)
+    render = at_night.clone()
+    render[20:100] = wall[20:100] + 0.3
+    at_night[20:100] = render[20:100]
+    at_night[40:80, 60:80] = 0.02  # somebody in front of the lit wall
+    at_night = torch.cat([at_night, torch.zeros(200, 160, 3)])
+    render = torch.cat([render, torch.zeros(200, 160, 3)])
+    evidence = transient_evidence(at_night, render)
+    assert evidence[45:75, 65:75].min() > 0.2
+    assert evidence[45:75, 100:150].max() < 0.05

@@ -22,6 +22,10 @@ HALF_EVIDENCE = 0.11
 MOST_EVIDENCE = 0.8
 """Maximum of the evidence, in units of the image loss: twice the initial λ^M, so that certain transients are hidden
 at once."""
+NIGHT, DUSK = 0.15, 0.3
+"""Median brightness of a photo below which it was taken at night, and from which on it was not."""
+LIT = 0.1
+"""How much brighter than its render a surface is that a lamp surely lights."""
 STRUCTURE_SIDE = 240
 """Approximate longer side, in pixels, to which larger photos are reduced for comparing structure."""
 STRUCTURE_WINDOWS = 24
@@ -59,7 +63,8 @@ def color_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]
     Let x be the difference of mean colours in cells, with a lower weight on brightness, minus its median over the
     photo. The median prevents the mask from hiding everything while the whole render is still poor. The evidence is
     proportional to ``x⁴ / (x⁴ + s⁴)``, a soft threshold that ignores small differences and saturates for large
-    ones.
+    ones. In photos taken at night, what is brighter than its render is lit by lamps and no evidence: a floodlit
+    wall that is hidden is never learnt, and where it is overexposed there is no structure to compare.
 
     Args:
         photo: I, RGB in [0, 1].
@@ -76,8 +81,14 @@ def color_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]
     hue = (cells - brightness).square().sum(dim=1, keepdim=True)
     distance = (2 * (hue + BRIGHTNESS_SHARE * brightness.square())).sqrt()
     fourth = (distance - distance.median()).clamp_min(0) ** 4
-    evidence = MOST_EVIDENCE * fourth / (fourth + HALF_EVIDENCE**4)
+    lit = (brightness / LIT).clamp(0, 1) * _night(photo[::side, ::side])
+    evidence = MOST_EVIDENCE * fourth / (fourth + HALF_EVIDENCE**4) * (1 - lit)
     return functional.interpolate(evidence, size=(height, width), mode="bilinear")[0, 0]
+
+
+def _night(photo: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+    """Degree to which a photo was taken at night, from 0 to 1."""
+    return ((DUSK - photo.mean(dim=2).median()) / (DUSK - NIGHT)).clamp(0, 1)
 
 
 @torch.no_grad()
