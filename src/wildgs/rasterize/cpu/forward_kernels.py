@@ -34,13 +34,14 @@ from wildgs.rasterize.cpu.simd import (
     vexp2,
     vmin,
 )
-from wildgs.rasterize.cpu.simd_memory import copy4, copy8, prefetch, vbits, vload, vspread, vstore
+from wildgs.rasterize.cpu.simd_memory import byte_bits, copy4, copy8, prefetch, vload, vspread, vstore
 from wildgs.threads import fetch_add
 
 PIXELS = TILE * TILE
 # A tile's list is worked off in batches: all of a batch's Gaussians for one block,
-# whose sums stay in registers.
-BATCH = 64
+# whose sums stay in registers. A bit per Gaussian takes two words: longer batches load and store sums less often.
+WORD = 64
+BATCH = 2 * WORD
 AHEAD = 16  # list entries between asking for a Gaussian's numbers and using them
 # A Gaussian in a batch: its record (see `reach_kernels.RECORD`) with the tile's first pixel centre minus the
 # Gaussian's in place of its centre, depth and colours, then u and v at that pixel.
@@ -51,7 +52,7 @@ MIN_TRANSMITTANCE = np.float32(1e-4)
 
 
 @njit(nogil=True)
-def load_batch(begin, count, entries, records, values, channels, tx, ty, batch, masks):
+def load_batch(begin, count, entries, records, values, channels, tx, ty, batch, masks, halves):
     """Copies `count` Gaussians of a tile's list into rows of `batch` and finds which blocks each reaches.
 
     They lie scattered in memory: they are asked for ahead of time.
@@ -71,19 +72,25 @@ def load_batch(begin, count, entries, records, values, channels, tx, ty, batch, 
         x, y = origin_x - batch[at + X], origin_y - batch[at + Y]
         a, b, d = batch[at + A], batch[at + B], batch[at + D]
         batch[at + U], batch[at + V] = a * x + b * y, d * y
-        masks[begin + i] = reach(
+        bits = reach(
             x, y, np.float32(4.0), a, b, d, batch[at + LEVEL], batch[at + Y_PER_X], batch[at + X_PER_Y]
         )
+        masks[begin + i] = bits
+        halves[i], halves[BATCH + i] = bits & 0xFF, bits >> 8
 
 
 @njit(nogil=True)
-def by_block(begin, count, masks, words):
-    """For each block of the tile a word with a bit for every Gaussian of the batch that reaches it."""
-    words[:] = 0
-    for group in range(0, count, LANES):
-        valid = (1 << min(count - group, LANES)) - 1
+def by_block(count, halves, words):
+    """For each block of the tile two words with a bit for every Gaussian of the batch that reaches it.
+
+    `halves` holds the lower bytes of the batch's masks, then the upper ones: a vector of bytes is one word.
+    """
+    for group in range(2):
+        left = count - group * WORD
+        valid = np.int64(-1) if left >= WORD else (np.int64(1) << max(left, 0)) - 1
         for block in range(16):
-            words[block] |= (mask_bits(vbits(masks, begin + group, block)) & valid) << group
+            at = (block >> 3) * BATCH + group * WORD
+            words[16 * group + block] = byte_bits(halves, at, block & 7) & valid
 
 
 @njit(nogil=True)
@@ -105,7 +112,8 @@ def blend_forward(
     reached = aligned(PIXELS)
     patch = aligned(PATCH)
     batch = aligned(FIELDS * BATCH)
-    words = np.empty(16, np.int64)
+    halves = np.empty(2 * BATCH, np.uint8)
+    words = np.empty(32, np.int64)
     while True:
         item = fetch_add(counter, 1)
         if item >= tile_order.size:
@@ -125,10 +133,12 @@ def blend_forward(
             if alive == 0:
                 break
             count = min(BATCH, end - start)
-            load_batch(start, count, entries, records, values, channels, tx, ty, batch, masks)
-            by_block(start, count, masks, words)
+            load_batch(start, count, entries, records, values, channels, tx, ty, batch, masks, halves)
+            by_block(count, halves, words)
             for block in range(16):
-                word = words[block]
+                word, later, first = words[block], words[16 + block], 0
+                if word == 0:
+                    word, later, first = later, 0, WORD
                 if (alive >> block) & 1 == 0 or word == 0:
                     continue
                 at = block * stride
@@ -140,8 +150,10 @@ def blend_forward(
                     red, green = vload(sums, at + COLORS * LANES), vload(sums, at + (COLORS + 1) * LANES)
                     blue = vload(sums, at + (COLORS + 2) * LANES)
                 while word != 0:
-                    i = lowest_bit(word)
+                    i = first + lowest_bit(word)
                     word &= word - 1
+                    if word == 0:
+                        word, later, first = later, 0, WORD
                     g = i * FIELDS
                     u = fma(px, vspread(batch, g + A), fma(py, vspread(batch, g + B), vspread(batch, g + U)))
                     v = fma(py, vspread(batch, g + D), vspread(batch, g + V))
@@ -167,10 +179,10 @@ def blend_forward(
                         green = fma(weight, vspread(batch, g + GREEN), green)
                         blue = fma(weight, vspread(batch, g + BLUE), blue)
                     else:
-                        first = (channels + 1) * entries[2 * (start + i)] + 1
+                        color = (channels + 1) * entries[2 * (start + i)] + 1
                         for k in range(channels):
                             to = at + (k + COLORS) * LANES
-                            vstore(sums, to, fma(weight, vspread(values, first + k), vload(sums, to)))
+                            vstore(sums, to, fma(weight, vspread(values, color + k), vload(sums, to)))
                 vstore(sums, at, before)
                 vstore(sums, at + LANES, px)
                 vstore(sums, at + 2 * LANES, total)

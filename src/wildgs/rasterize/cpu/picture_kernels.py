@@ -7,7 +7,16 @@ import numpy as np
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.reach_kernels import TILE
 from wildgs.rasterize.cpu.simd import lane_x, select, splat, vmin
-from wildgs.rasterize.cpu.simd_memory import prefetch, prefetch_to_write, vload, vload3, vstore, vstore3
+from wildgs.rasterize.cpu.simd_memory import (
+    copy4,
+    copy8,
+    prefetch,
+    prefetch_to_write,
+    vload,
+    vload3,
+    vstore,
+    vstore3,
+)
 
 LANES = 16
 PATCH = 48  # floats that a block of three channels has
@@ -29,9 +38,11 @@ def put_rows(patch, per_pixel, picture, x, y, width, height):
     row, count = 4 * per_pixel, min(4, width - x) * per_pixel
     for line in range(min(4, height - y)):
         at = ((y + line) * width + x) * per_pixel
-        if count == 12:
-            for k in range(12):
-                picture[at + k] = patch[line * 12 + k]
+        if count == row == 12:
+            copy8(picture, at, patch, line * 12)
+            copy4(picture, at + 8, patch, line * 12 + 8)
+        elif count == row == 4:
+            copy4(picture, at, patch, line * 4)
         else:
             for k in range(count):
                 picture[at + k] = patch[line * row + k]
@@ -45,9 +56,11 @@ def get_rows(patch, per_pixel, picture, x, y, width, height):
         patch[:] = 0.0
     for line in range(min(4, height - y)):
         at = ((y + line) * width + x) * per_pixel
-        if count == 12:
-            for k in range(12):
-                patch[line * 12 + k] = picture[at + k]
+        if count == row == 12:
+            copy8(patch, line * 12, picture, at)
+            copy4(patch, line * 12 + 8, picture, at + 8)
+        elif count == row == 4:
+            copy4(patch, line * 4, picture, at)
         else:
             for k in range(count):
                 patch[line * row + k] = picture[at + k]

@@ -8,7 +8,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from wildgs.rasterize.cpu.simd import INT_VECTOR, LANES, MASK, VECTOR, VECTOR_IR, splat_ir
+from wildgs.rasterize.cpu.simd import INT_VECTOR, LANES, VECTOR, VECTOR_IR, splat_ir
 
 
 def _element_pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, offset: Any) -> ir.Value:
@@ -65,25 +65,27 @@ def vspread(typingctx, array, offset):
 
 
 @intrinsic
-def vbits(typingctx, array, offset, bit):
-    """Of sixteen numbers of a C-contiguous int32 array, from flat element `offset` on: which have bit `bit` set."""
-    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.int32):
+def byte_bits(typingctx, array, offset, bit):
+    """Which of 64 bytes of a uint8 array (C-contiguous), from element `offset` on, have bit `bit` set, as bits."""
+    if not (isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8):
         return None
+    kind = ir.VectorType(ir.IntType(8), 64)
 
     def codegen(context, builder, sig, args):
         offset, bit = (context.cast(builder, args[i], sig.args[i], types.intp) for i in (1, 2))
         pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
-        numbers = builder.load(builder.bitcast(pointer, INT_VECTOR.as_pointer()), align=4)
-        one = builder.trunc(builder.shl(ir.Constant(ir.IntType(64), 1), bit), ir.IntType(32))
-        wanted = builder.insert_element(
-            ir.Constant(INT_VECTOR, ir.Undefined), one, ir.Constant(ir.IntType(32), 0)
-        )
+        numbers = builder.load(builder.bitcast(pointer, kind.as_pointer()), align=1)
+        one = builder.shl(ir.Constant(ir.IntType(8), 1), builder.trunc(bit, ir.IntType(8)))
+        undefined = ir.Constant(kind, ir.Undefined)
+        wanted = builder.insert_element(undefined, one, ir.Constant(ir.IntType(32), 0))
         wanted = builder.shuffle_vector(
-            wanted, ir.Constant(INT_VECTOR, ir.Undefined), ir.Constant(INT_VECTOR, [0] * LANES)
+            wanted, undefined, ir.Constant(ir.VectorType(ir.IntType(32), 64), [0] * 64)
         )
-        return builder.icmp_signed("!=", builder.and_(numbers, wanted), ir.Constant(INT_VECTOR, [0] * LANES))
+        zero = ir.Constant(kind, [0] * 64)
+        mask = builder.icmp_unsigned("!=", builder.and_(numbers, wanted), zero)
+        return builder.bitcast(mask, ir.IntType(64))
 
-    return MASK(array, offset, bit), codegen
+    return types.int64(array, offset, bit), codegen
 
 
 def _copier(count: int) -> Any:
