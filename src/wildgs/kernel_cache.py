@@ -25,7 +25,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 
 from wildgs.errors import WildGSWarning
 
-_SHARED = ("threads.py", "kernel_cache.py")
+_SHARED = ("threads.py", "kernel_cache.py", "rasterize/cpu/simd.py", "rasterize/cpu/simd_memory.py")
 """Files of the package that all kernels use."""
 
 

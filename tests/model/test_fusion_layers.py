@@ -7,7 +7,9 @@ import torch
 from torch.nn import functional
 
 from wildgs.model import fusion_layers
-from wildgs.model.fusion_layers import PARTS, ChunkedLayers, SplitLinear
+from wildgs.model.fusion_kernels import PART
+from wildgs.model.fusion_layers import PARTS, ChunkedLayers, FusedLayers, SplitLinear, layers_over_rows
+from wildgs.threads import kernels_limited
 
 
 @pytest.mark.parametrize("count", [3, PARTS, 2 * PARTS + 5])
@@ -28,31 +30,87 @@ def test_value_and_gradients_are_those_of_a_linear_layer(count: int, learns_rows
         torch.testing.assert_close(found, wanted, atol=1e-4, rtol=1e-4)
 
 
+def plain_layers(rows, first, first_bias, second, second_bias, last, last_bias, direct=None):
+    hidden = functional.linear(rows, first, first_bias).relu()
+    output = functional.linear(functional.linear(hidden, second, second_bias).relu(), last, last_bias)
+    return output if direct is None else output + rows @ direct.T
+
+
+def layer_inputs(count: int, inputs: int, hidden: int, outputs: int) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shapes = [(count, inputs), (hidden, inputs), (hidden,), (hidden, hidden), (hidden,)]
+    shapes += [(outputs, hidden), (outputs,), (outputs, inputs)]
+    return [0.5 * torch.randn(shape, generator=generator) for shape in shapes]
+
+
+def value_and_gradients(function, leaves: list[torch.Tensor]) -> list[torch.Tensor]:
+    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+    value = function(*leaves)
+    weights = torch.randn(value.shape, generator=torch.Generator().manual_seed(1))
+    return [value.detach(), *torch.autograd.grad((value * weights).sum(), leaves)]
+
+
 @pytest.mark.parametrize("count", [1, 8, 21])
 @pytest.mark.parametrize("skips", [True, False])
 def test_chunks_have_the_value_and_gradients_of_plain_layers(
     monkeypatch: pytest.MonkeyPatch, count: int, skips: bool
 ):
     monkeypatch.setattr(fusion_layers, "CHUNK", 8)
-    generator = torch.Generator().manual_seed(0)
-    shapes = [(count, 5), (6, 5), (6,), (6, 6), (6,), (4, 6), (4,), (4, 5)][: 8 if skips else 7]
-    leaves = [torch.randn(shape, generator=generator).requires_grad_() for shape in shapes]
-    weights = torch.randn(count, 4, generator=generator)
-
-    def plain(rows, first, first_bias, second, second_bias, last, last_bias, direct=None):
-        hidden = functional.linear(rows, first, first_bias).relu()
-        output = functional.linear(functional.linear(hidden, second, second_bias).relu(), last, last_bias)
-        return output if direct is None else output + rows @ direct.T
+    leaves = layer_inputs(count, 5, 6, 4)[: 8 if skips else 7]
 
     def chunked(*given):
         return ChunkedLayers.apply(*given, *([] if skips else [None]), torch.float32)
 
-    results = []
-    for function in (plain, chunked):
-        value = function(*leaves)
-        results.append((value.detach(), *torch.autograd.grad((value * weights).sum(), leaves)))
+    results = [value_and_gradients(function, leaves) for function in (plain_layers, chunked)]
     for found, wanted in zip(*results, strict=True):
         torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2 * PART + 100])
+@pytest.mark.parametrize(
+    ("inputs", "hidden", "outputs"), [(32, 48, 12), (5, 20, 3), (33, 64, 48), (16, 16, 27)]
+)
+def test_kernels_have_the_value_and_gradients_of_plain_layers(
+    count: int, inputs: int, hidden: int, outputs: int
+):
+    leaves = layer_inputs(count, inputs, hidden, outputs)
+    for given in (leaves, leaves[:7]):
+
+        def fused(*given):
+            return FusedLayers.apply(*given, *([] if len(given) == 8 else [None]))
+
+        results = [value_and_gradients(function, given) for function in (fused, plain_layers)]
+        for found, wanted in zip(*results, strict=True):
+            scale = wanted.abs().max().clamp_min(1e-6) if wanted.numel() else 1.0
+            torch.testing.assert_close(found / scale, wanted / scale, atol=1e-5, rtol=0)
+
+
+def test_kernels_do_not_depend_on_the_number_of_threads():
+    leaves = layer_inputs(3 * PART + 7, 32, 48, 12)
+    results = []
+    for threads in (1, 3):
+        with kernels_limited(threads):
+            results.append(value_and_gradients(FusedLayers.apply, leaves))
+    assert all(torch.equal(one, three) for one, three in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("place", range(8))
+def test_kernels_do_not_hide_what_is_not_finite(place: int):
+    """Steps with non-finite values are skipped, which needs them to arrive at the loss."""
+    leaves = layer_inputs(4, 32, 48, 12)
+    leaves[place].view(-1)[0] = torch.nan
+    assert FusedLayers.apply(*leaves).isnan().any()
+
+
+@pytest.mark.parametrize(
+    ("avx512", "kind"), [(True, "FusedLayersBackward"), (False, "ChunkedLayersBackward")]
+)
+def test_processors_without_avx512_use_the_library(monkeypatch: pytest.MonkeyPatch, avx512: bool, kind: str):
+    monkeypatch.setattr(fusion_layers, "has_avx512", lambda: avx512)
+    leaves = [leaf.requires_grad_() for leaf in layer_inputs(20, 5, 6, 4)]
+    value = layers_over_rows(*leaves, precision=torch.float32)
+    assert type(value.grad_fn).__name__ == kind
+    torch.testing.assert_close(value, plain_layers(*leaves), atol=1e-5, rtol=1e-5)
 
 
 def test_the_skip_connection_is_not_rounded():

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.config import FusionConfig
-from wildgs.model.fusion_layers import ChunkedLayers, linear_over_rows
+from wildgs.model.fusion_layers import layers_over_rows, linear_over_rows
 from wildgs.model.precision import MixedModule
 
 
@@ -74,7 +74,7 @@ class Fusion(MixedModule):
         """
         output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         if not intrinsic.is_cuda and _is_shared(local_embeddings):
-            fused = ChunkedLayers.apply(
+            fused = layers_over_rows(
                 intrinsic,
                 self.first_rows.weight[:, local_embeddings.shape[1] :],
                 self._first_bias(global_embedding, local_embeddings[0]),
@@ -83,7 +83,7 @@ class Fusion(MixedModule):
                 output,
                 bias,
                 direct,
-                self.precision,
+                precision=self.precision,
             )
             return fused.reshape(-1, self.coefficients, 3)
         with self.mixed(intrinsic.device):

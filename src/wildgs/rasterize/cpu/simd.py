@@ -15,6 +15,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin
+from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, models, register_model
 
@@ -52,6 +53,12 @@ class _VectorModel(models.PrimitiveModel):
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: types.Type) -> None:
         super().__init__(dmm, fe_type, _MASK_VECTOR)
+
+
+def has_avx512() -> bool:
+    """Whether kernels are compiled for a processor with AVX-512 (`NUMBA_CPU_FEATURES` overrides what it has)."""
+    _, _, instructions = cpu_target.target_context.codegen().magic_tuple()
+    return "+avx512dq" in instructions.split(",")
 
 
 def splat_ir(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
@@ -201,7 +208,8 @@ def _call_vector_intrinsic(builder: ir.IRBuilder, name: str, *values: ir.Value) 
     return builder.call(function, values)
 
 
-def _fused(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+def fused_ir(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+    """A * b + c for vectors, in LLVM's terms."""
     return _call_vector_intrinsic(builder, "fmuladd", a, b, c)
 
 
@@ -213,7 +221,7 @@ def fma(typingctx, a, b, c):
 
     def codegen(context, builder, sig, args):
         vectors = [_as_vector(context, builder, v, k) for v, k in zip(args, sig.args, strict=True)]
-        return _fused(builder, *vectors)
+        return fused_ir(builder, *vectors)
 
     return VECTOR(a, b, c), codegen
 
@@ -277,8 +285,7 @@ def vexp2(typingctx, value):
     """
 
     def codegen(context, builder, sig, args):
-        emit = _scaled_exp2 if "+avx512dq" in context.codegen().magic_tuple()[2].split(",") else _shifted_exp2
-        return emit(builder, args[0])
+        return (_scaled_exp2 if has_avx512() else _shifted_exp2)(builder, args[0])
 
     return (VECTOR(value), codegen) if value is VECTOR else None
 
@@ -286,7 +293,7 @@ def vexp2(typingctx, value):
 def _polynomial(builder: ir.IRBuilder, x: ir.Value, coefficients: tuple[float, ...]) -> ir.Value:
     result, *others = (_constant([c] * LANES) for c in coefficients)
     for coefficient in others:
-        result = _fused(builder, result, x, coefficient)
+        result = fused_ir(builder, result, x, coefficient)
     return result
 
 
@@ -339,7 +346,7 @@ def vlog2(typingctx, value):
         square = builder.fmul(ratio, ratio)
         series = floats(1.0 / 9.0)
         for odd in (7.0, 5.0, 3.0, 1.0):
-            series = _fused(builder, series, square, floats(1.0 / odd))
+            series = fused_ir(builder, series, square, floats(1.0 / odd))
         logarithm = builder.fmul(builder.fmul(series, ratio), floats(2.8853900817779268))
         return builder.fadd(logarithm, builder.sitofp(whole, VECTOR_IR), flags=_FLAGS)
 

@@ -11,7 +11,8 @@ from numba.extending import intrinsic
 from wildgs.rasterize.cpu.simd import INT_VECTOR, LANES, VECTOR, VECTOR_IR, splat_ir
 
 
-def _element_pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, offset: Any) -> ir.Value:
+def element_pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: Any, offset: Any) -> ir.Value:
+    """The address of an array's flat element, in LLVM's terms."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.gep(data, [offset])
 
@@ -28,7 +29,7 @@ def vload(typingctx, array, offset):
 
     def codegen(context, builder, sig, args):
         offset = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+        pointer = element_pointer(context, builder, sig.args[0], args[0], offset)
         return builder.load(builder.bitcast(pointer, VECTOR_IR.as_pointer()), align=4)
 
     return VECTOR(array, offset), codegen
@@ -42,7 +43,7 @@ def vstore(typingctx, array, offset, value):
 
     def codegen(context, builder, sig, args):
         offset = context.cast(builder, args[1], sig.args[1], types.intp)
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+        pointer = element_pointer(context, builder, sig.args[0], args[0], offset)
         builder.store(args[2], builder.bitcast(pointer, VECTOR_IR.as_pointer()), align=4)
         return context.get_dummy_value()
 
@@ -58,7 +59,7 @@ def vspread(typingctx, array, offset):
     def codegen(context, builder, sig, args):
         offset = context.cast(builder, args[1], sig.args[1], types.intp)
         return splat_ir(
-            builder, builder.load(_element_pointer(context, builder, sig.args[0], args[0], offset))
+            builder, builder.load(element_pointer(context, builder, sig.args[0], args[0], offset))
         )
 
     return VECTOR(array, offset), codegen
@@ -73,7 +74,7 @@ def byte_bits(typingctx, array, offset, bit):
 
     def codegen(context, builder, sig, args):
         offset, bit = (context.cast(builder, args[i], sig.args[i], types.intp) for i in (1, 2))
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+        pointer = element_pointer(context, builder, sig.args[0], args[0], offset)
         numbers = builder.load(builder.bitcast(pointer, kind.as_pointer()), align=1)
         one = builder.shl(ir.Constant(ir.IntType(8), 1), builder.trunc(bit, ir.IntType(8)))
         undefined = ir.Constant(kind, ir.Undefined)
@@ -98,7 +99,7 @@ def _copier(count: int) -> Any:
             places = []
             for i in (0, 2):
                 offset = context.cast(builder, args[i + 1], sig.args[i + 1], types.intp)
-                place = _element_pointer(context, builder, sig.args[i], args[i], offset)
+                place = element_pointer(context, builder, sig.args[i], args[i], offset)
                 places.append(builder.bitcast(place, kind))
             builder.store(builder.load(places[1], align=4), places[0], align=4)
             return context.get_dummy_value()
@@ -119,7 +120,7 @@ def _prefetcher(to_write: int) -> Any:
 
         def codegen(context, builder, sig, args):
             offset = context.cast(builder, args[1], sig.args[1], types.intp)
-            pointer = _element_pointer(context, builder, sig.args[0], args[0], offset)
+            pointer = element_pointer(context, builder, sig.args[0], args[0], offset)
             byte_pointer = ir.IntType(8).as_pointer()
             int32 = ir.IntType(32)
             kind = ir.FunctionType(ir.VoidType(), [byte_pointer, int32, int32, int32])
@@ -145,7 +146,7 @@ def _columns_loader(count: int) -> Any:
 
         def codegen(context, builder, sig, args):
             offset = context.cast(builder, args[1], sig.args[1], types.intp)
-            base = _element_pointer(context, builder, sig.args[0], args[0], offset)
+            base = element_pointer(context, builder, sig.args[0], args[0], offset)
             base = builder.bitcast(base, VECTOR_IR.as_pointer())
             steps = [ir.Constant(ir.IntType(64), i) for i in range(count)]
             vectors = [builder.load(builder.gep(base, [step]), align=4) for step in steps]
@@ -166,7 +167,7 @@ def _columns_storer(count: int) -> Any:
 
         def codegen(context, builder, sig, args):
             offset = context.cast(builder, args[1], sig.args[1], types.intp)
-            base = _element_pointer(context, builder, sig.args[0], args[0], offset)
+            base = element_pointer(context, builder, sig.args[0], args[0], offset)
             base = builder.bitcast(base, VECTOR_IR.as_pointer())
             columns = [builder.extract_value(args[2], i) for i in range(count)]
             for i in range(count):
