@@ -41,6 +41,8 @@ COUNTS = (10_000, 100_000, 1_000_000)
 REFERENCE_LIMIT = 1e9  # (Gaussian, pixel) pairs that the dense reference is asked for
 # Multiply-adds beside the exponential that one block of 16 pixels needs, forward and backward.
 BLEND_FMAS = {"forward": 14, "backward": 36}
+EXPONENTIAL_FMAS = 12
+"""Multiply-adds that an exponential is worth."""
 PEAK_ROUNDS, PEAK_EXPONENTIALS, PEAK_FMAS = 20_000, 4, 56
 
 
@@ -83,14 +85,13 @@ def peak_kernel(counter, chunks, out):
         vstore(out, chunk * 16, a + b + c + d + e + f + g + h)
 
 
-def peak_seconds_per_block(fmas: int) -> float:
-    """What one exponential and `fmas` multiply-adds of sixteen pixels take on all threads at their best."""
+def peak_seconds_per_fma() -> float:
+    """What a multiply-add of sixteen numbers takes on all threads at their best."""
     chunks = 4 * thread_count()
     out = np.empty(16 * chunks, np.float32)
     seconds = min(timed(lambda: launch(peak_kernel, chunks, out)) for _ in range(7))
     per_block = seconds / (chunks * PEAK_ROUNDS * PEAK_EXPONENTIALS)
-    # The kernel has 14 multiply-adds per exponential; an exponential is worth about 12.
-    return per_block * (fmas + 12) / (PEAK_FMAS / PEAK_EXPONENTIALS + 12)
+    return per_block / (PEAK_FMAS / PEAK_EXPONENTIALS + EXPONENTIAL_FMAS)
 
 
 @njit(nogil=True, cache=True)
@@ -140,10 +141,18 @@ def add_rates(row: Row, projection: Projection) -> None:
     row.forward_per_second = row.pixel_gaussians / row.forward_ms * 1e3
     row.backward_per_second = row.pixel_gaussians / row.backward_ms * 1e3
     row.share_of_peak_forward = (
-        1e3 * blocks * peak_seconds_per_block(BLEND_FMAS["forward"]) / row.forward_min_ms
+        1e3
+        * blocks
+        * peak_seconds_per_fma()
+        * (BLEND_FMAS["forward"] + EXPONENTIAL_FMAS)
+        / row.forward_min_ms
     )
     row.share_of_peak_backward = (
-        1e3 * blocks * peak_seconds_per_block(BLEND_FMAS["backward"]) / row.backward_min_ms
+        1e3
+        * blocks
+        * peak_seconds_per_fma()
+        * (BLEND_FMAS["backward"] + EXPONENTIAL_FMAS)
+        / row.backward_min_ms
     )
 
 
