@@ -1,8 +1,8 @@
 """`python -m benchmarks.stereo`: cost of comparing planes in multi-view stereo, and of a photo's depth.
 
-Prints nanoseconds per plane and neighbour on one thread with the share of peak (the time that the multiply-adds alone
-would take, see `benchmarks.rasterize`), and seconds and memory per photo of the demo's scene on as
-many threads as `WILDGS_NUM_THREADS` says, without compilation.
+Prints nanoseconds per plane and neighbour on one thread with the share of peak (the time that the multiply-adds
+alone would take, see `benchmarks.rasterize`), and seconds and memory per photo of the demo's scene on as many threads
+as `WILDGS_NUM_THREADS` says, without compilation.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from wildgs.threads import thread_count
 
 NEIGHBOURS, WIDTH, HEIGHT = 6, 400, 300
 FMAS = 14
-"""Multiply-adds per pixel of a window: projection, interpolation and sums. Gathers, conversions, clamps and the division
-are not counted."""
+"""Multiply-adds per pixel of a window: projection, interpolation and sums. Gathers, conversions, clamps and the
+division are not counted."""
 
 
 @dataclass(frozen=True)
