@@ -1,8 +1,8 @@
 """`python -m benchmarks.stereo`: cost of comparing planes in multi-view stereo, and of a photo's depth.
 
 Prints nanoseconds per plane and neighbour on one thread with the share of peak (the time that the multiply-adds
-alone would take, see `benchmarks.rasterize`), and seconds and memory per photo of the demo's scene on as many threads
-as `WILDGS_NUM_THREADS` says, without compilation.
+alone would take, see `benchmarks.rasterize`), and seconds and memory per photo of the demo's scene on as many
+threads as `WILDGS_NUM_THREADS` says, without compilation.
 """
 
 from __future__ import annotations
