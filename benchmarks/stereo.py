@@ -1,7 +1,7 @@
 """`python -m benchmarks.stereo`: cost of comparing planes in multi-view stereo, and of a photo's depth.
 
 Prints nanoseconds per plane and neighbour on one thread with the share of peak (the time that the multiply-adds
-alone would take, see `benchmarks.rasterize`), and seconds and memory per photo of the demo's scene on as many
+alone would take, see `benchmarks.peak`), and seconds and memory per photo of the demo's scene on as many
 threads as `WILDGS_NUM_THREADS` says, without compilation.
 """
 
@@ -17,7 +17,7 @@ import numba
 import numpy as np
 import tyro
 
-from benchmarks.rasterize import peak_seconds_per_fma
+from benchmarks.peak import peak_seconds_per_fma
 from benchmarks.resized_demo import write_resized_demo
 from wildgs.priors.config import StereoConfig
 from wildgs.priors.stereo import cost_kernels as kernels
