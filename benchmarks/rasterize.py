@@ -28,20 +28,18 @@ import numpy as np
 import torch
 from numba import njit
 
+from peak import EXPONENTIAL_FMAS, peak_seconds_per_fma
 from rasterize_against import compare
-from rasterize_scene import make_scene, time_once, timed
+from rasterize_scene import make_scene, time_once
 from wildgs.rasterize import BackendName, Projection
 from wildgs.rasterize.cpu.reach_kernels import HALF, RECORD, count_bits, reach
-from wildgs.rasterize.cpu.simd import fma, splat, vexp2
-from wildgs.rasterize.cpu.simd_memory import vstore
-from wildgs.threads import fetch_add, launch, thread_count
+from wildgs.threads import thread_count
 
 SIZES = ((320, 240), (640, 480), (1280, 960))
 COUNTS = (10_000, 100_000, 1_000_000)
 REFERENCE_LIMIT = 1e9  # (Gaussian, pixel) pairs that the dense reference is asked for
 # Multiply-adds beside the exponential that one block of 16 pixels needs, forward and backward.
 BLEND_FMAS = {"forward": 14, "backward": 36}
-PEAK_ROUNDS, PEAK_EXPONENTIALS, PEAK_FMAS = 20_000, 4, 56
 
 
 @dataclass
@@ -64,33 +62,6 @@ class Row:
     share_of_peak_forward: float | None = None
     share_of_peak_backward: float | None = None
     times_faster_than_reference: float | None = None
-
-
-@njit(nogil=True, cache=True)
-def peak_kernel(counter, chunks, out):
-    """Exponentials and multiply-adds in the blend's proportion with nothing to wait for."""
-    while True:
-        chunk = fetch_add(counter, 1)
-        if chunk >= chunks:
-            break
-        a, b, c, d = splat(-0.1), splat(-0.2), splat(-0.3), splat(-0.4)
-        e, f, g, h = splat(0.1), splat(0.2), splat(0.3), splat(0.4)
-        for _ in range(PEAK_ROUNDS):
-            for _ in range(PEAK_FMAS // 8):
-                a, b, c, d = fma(a, 0.5, -0.1), fma(b, 0.5, -0.1), fma(c, 0.5, -0.1), fma(d, 0.5, -0.1)
-                e, f, g, h = fma(e, 0.5, 0.1), fma(f, 0.5, 0.1), fma(g, 0.5, 0.1), fma(h, 0.5, 0.1)
-            e, f, g, h = e + vexp2(a), f + vexp2(b), g + vexp2(c), h + vexp2(d)
-        vstore(out, chunk * 16, a + b + c + d + e + f + g + h)
-
-
-def peak_seconds_per_block(fmas: int) -> float:
-    """What one exponential and `fmas` multiply-adds of sixteen pixels take on all threads at their best."""
-    chunks = 4 * thread_count()
-    out = np.empty(16 * chunks, np.float32)
-    seconds = min(timed(lambda: launch(peak_kernel, chunks, out)) for _ in range(7))
-    per_block = seconds / (chunks * PEAK_ROUNDS * PEAK_EXPONENTIALS)
-    # The kernel has 14 multiply-adds per exponential; an exponential is worth about 12.
-    return per_block * (fmas + 12) / (PEAK_FMAS / PEAK_EXPONENTIALS + 12)
 
 
 @njit(nogil=True, cache=True)
@@ -140,10 +111,18 @@ def add_rates(row: Row, projection: Projection) -> None:
     row.forward_per_second = row.pixel_gaussians / row.forward_ms * 1e3
     row.backward_per_second = row.pixel_gaussians / row.backward_ms * 1e3
     row.share_of_peak_forward = (
-        1e3 * blocks * peak_seconds_per_block(BLEND_FMAS["forward"]) / row.forward_min_ms
+        1e3
+        * blocks
+        * peak_seconds_per_fma()
+        * (BLEND_FMAS["forward"] + EXPONENTIAL_FMAS)
+        / row.forward_min_ms
     )
     row.share_of_peak_backward = (
-        1e3 * blocks * peak_seconds_per_block(BLEND_FMAS["backward"]) / row.backward_min_ms
+        1e3
+        * blocks
+        * peak_seconds_per_fma()
+        * (BLEND_FMAS["backward"] + EXPONENTIAL_FMAS)
+        / row.backward_min_ms
     )
 
 

@@ -84,7 +84,8 @@ def main() -> None:
         print(
             f"{arguments.scene} every {arguments.every}: {len(found) - strangers} of {len(files)} registered,"
             f" {strangers} strangers, AUC@5 {auc(scores, 5):.3f}, AUC@10 {auc(scores, 10):.3f},"
-            f" {report.pairs} pairs, {time.perf_counter() - started:.0f} s"
+            f" {report.pairs} pairs, other places {[len(group) for group in report.other_places]},"
+            f" {time.perf_counter() - started:.0f} s"
             f" ({time.process_time() - used:.0f} s of CPU)"
         )
 

@@ -1,7 +1,8 @@
-"""`python benchmarks/stereo.py`: cost of comparing planes in multi-view stereo, and of a photo's depth.
+"""`python -m benchmarks.stereo`: cost of comparing planes in multi-view stereo, and of a photo's depth.
 
-Prints nanoseconds per plane and neighbour on one thread, and seconds and memory per photo of the demo's scene on as
-many threads as `WILDGS_NUM_THREADS` says, without compilation.
+Prints nanoseconds per plane and neighbour on one thread with the share of peak (the time that the multiply-adds
+alone would take, see `benchmarks.peak`), and seconds and memory per photo of the demo's scene on as many
+threads as `WILDGS_NUM_THREADS` says, without compilation.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numba
 import numpy as np
 import tyro
 
+from benchmarks.peak import peak_seconds_per_fma
 from benchmarks.resized_demo import write_resized_demo
 from wildgs.priors.config import StereoConfig
 from wildgs.priors.stereo import cost_kernels as kernels
@@ -24,6 +26,9 @@ from wildgs.scene import DataConfig, load_scene
 from wildgs.threads import thread_count
 
 NEIGHBOURS, WIDTH, HEIGHT = 6, 400, 300
+FMAS = 14
+"""Multiply-adds per pixel of a window: projection, interpolation and sums. Gathers, conversions, clamps and the
+division are not counted."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,9 @@ def nanoseconds_per_comparison(planes: int) -> float:
 
 def main(command: Command) -> None:
     """Prints the figures."""
-    print(f"{nanoseconds_per_comparison(command.planes):.0f} ns per plane and neighbour, one thread")
+    spent = nanoseconds_per_comparison(command.planes)
+    least = peak_seconds_per_fma() * thread_count() * 1e9 * FMAS * kernels.SAMPLES / 16
+    print(f"{spent:.0f} ns per plane and neighbour, one thread, {least / spent:.0%} of peak")
     with tempfile.TemporaryDirectory() as folder:
         root = write_resized_demo(Path(folder) / "scene", photos=command.photos)
         scene = load_scene(root, DataConfig(max_side=command.max_side, use_depth=False))

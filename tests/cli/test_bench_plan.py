@@ -12,7 +12,7 @@ from wildgs.config import RunConfig, differing_entries, with_entries, write_conf
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.benchmark_table import PHOTOTOURISM, published_figures
 from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant
-from wildgs.library.config import BENCH_METHODS, default_bench_methods, reference_preset
+from wildgs.library.config import BENCH_METHODS, ENTRIES_WITHOUT, default_bench_methods, reference_preset
 from wildgs.model.registry import METHODS
 from wildgs.model.wildgs import Ablation
 from wildgs.presets import with_preset
@@ -22,7 +22,7 @@ BASE = RunConfig(Path())
 
 def test_every_ablation_is_a_method_with_a_label():
     ablations = {name.removeprefix("without-") for name in BENCH_METHODS if name.startswith("without-")}
-    assert ablations == set(get_args(Ablation))
+    assert ablations == {*get_args(Ablation), *ENTRIES_WITHOUT}
     assert [label_of(name) for name in ("3dgs", "wildgs-half-steps", "without-reverse", "mine")] == [
         "3DGS",
         "Wild-GS†",
@@ -33,9 +33,17 @@ def test_every_ablation_is_a_method_with_a_label():
         config = method_config(name, with_entries(BASE, {"model.local_embeddings": True}))
         assert config.method == (name if name in METHODS else "wildgs")
         if config.method == "wildgs":
-            expected = (name.removeprefix("without-"),) if name.startswith("without-") else ()
-            assert config.model.without == expected
+            part = name.removeprefix("without-")
+            assert config.model.without == ((part,) if part in get_args(Ablation) else ())
     assert method_config("wildgs-half-steps", BASE).train.steps == BASE.train.steps // 2
+
+
+@pytest.mark.parametrize("part", list(ENTRIES_WITHOUT))
+def test_rows_without_additions_change_only_these(part: str):
+    base = with_entries(BASE, {"train.dropout.rate": 0.2})
+    changed = differing_entries(base, method_config(f"without-{part}", base))
+    assert {path: new for path, (_, new) in changed.items()} == ENTRIES_WITHOUT[part]
+    assert (f"without-{part}" in default_bench_methods(None)) == (part == "growth")
 
 
 @pytest.mark.parametrize(

@@ -109,3 +109,15 @@ def test_a_stray_camera_asks_for_no_large_grid(monkeypatch) -> None:
     assert largest <= 2_000_000
     middle = filled[filled[:, :2].norm(dim=1) < 0.45]
     assert len(middle) > 0.8 * 3.14 * 0.45**2 / config.spacing**2
+
+
+def test_stairs_with_most_of_the_points_do_not_raise_the_plane() -> None:
+    """To cameras at eye height, a plane tilted by a flight of stairs is the wrong ground."""
+    x, y = torch.rand(2, 6000, generator=torch.Generator().manual_seed(0))
+    stairs = torch.stack([1.6 * x - 0.8, 1.0 + 0.6 * y, 0.02 * (4 * y).floor() - 0.49], dim=1)
+    ground = paving(noise=0.001)[:500]
+    eyes = torch.stack([torch.linspace(-1, 1, 9), torch.full((9,), -1.0), torch.full((9,), -0.43)], dim=1)
+    plane = find_ground(torch.cat([ground, stairs]), eyes, 0.03, torch.Generator().manual_seed(0))
+    assert plane is not None
+    feet = torch.cat([eyes[:, :2], torch.ones(9, 1)], dim=1) @ plane
+    torch.testing.assert_close(feet, torch.full((9,), -0.5), atol=0.002, rtol=0)

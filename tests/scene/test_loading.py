@@ -536,6 +536,7 @@ def test_metric_depth_in_other_units_is_refused(make_scene: MakeScene, factor: f
     write_metric_depth(root, scene, 1.0)
     load_scene(root)
     write_metric_depth(root, scene, factor)
+    assert load_scene(root, DataConfig(use_metric_depth=False)).views[0].read_depth() is None
     with pytest.raises(UserError, match=rf"metric depth \(.tiff\) is {int(factor)}[.\d]* times the depth"):
         load_scene(root)
     load_scene(root, DataConfig(use_depth=False))

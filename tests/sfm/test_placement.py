@@ -1,4 +1,4 @@
-from wildgs.sfm.placement import _groups
+from wildgs.sfm.placement import Failure, _groups, other_places
 
 
 def test_photos_that_match_each_other_alone_form_a_group() -> None:
@@ -15,3 +15,15 @@ def test_photos_that_match_each_other_alone_form_a_group() -> None:
 def test_groups_that_a_later_pair_links_become_one() -> None:
     groups = _groups([0, 1, 2, 3], {(0, 1): 50, (2, 3): 50, (1, 3): 50})
     assert all(sorted(group) == [0, 1, 2, 3] for group in groups.values())
+
+
+def test_photos_of_a_smaller_model_form_a_group() -> None:
+    groups = _groups([1, 2, 3, 4, 5], {(3, 4): 50}, [[1, 2, 3]])  # few matches each, but one model
+    assert sorted(groups[1]) == sorted(groups[4]) == [1, 2, 3, 4]
+    assert groups[5] == [5]
+
+
+def test_other_places_are_listed_once_and_the_largest_first() -> None:
+    small, large = ("x", "y", "z"), ("a", "b", "c", "d")
+    failed = [Failure("", None, group) for group in (small, large, small, ())]
+    assert other_places(failed) == (large, small)

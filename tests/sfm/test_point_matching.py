@@ -10,7 +10,7 @@ from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import continue_mapping, map_photos, missing_from
 from wildgs.sfm.match_pictures import SIDE, draw_matches, write_match_pictures
 from wildgs.sfm.matching import describe_photos, image_ids, verified_pairs
-from wildgs.sfm.placement import Findings, failures
+from wildgs.sfm.placement import Findings, failures, other_places
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -63,6 +63,7 @@ def test_photos_that_only_match_each_other_are_named_as_a_group(
     work, copies = matched
     reasons = failures(work, copies, [pycolmap.Reconstruction()], Findings())
     assert "separate group of 6 photos (with 1.jpg, 2.jpg, 3.jpg)" in reasons["0.jpg"].reason
+    assert other_places(reasons.values()) == (tuple(f"{number}.jpg" for number in range(6)),)
 
 
 def test_lines_end_where_the_matches_are() -> None:

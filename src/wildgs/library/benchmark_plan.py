@@ -15,7 +15,7 @@ import yaml
 from wildgs.config import CONFIG_FILE, RunConfig, differing_entries, read_config, with_entries
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.benchmark_table import PHOTOTOURISM
-from wildgs.library.config import BENCH_METHODS, HALF, WITHOUT
+from wildgs.library.config import BENCH_METHODS, ENTRIES_WITHOUT, HALF, WITHOUT
 from wildgs.model.registry import METHODS, method_type
 from wildgs.presets import PRESETS, PresetName, with_preset
 from wildgs.scene.colmap import find_model
@@ -197,7 +197,10 @@ def method_config(method: str, base: RunConfig, reference: PresetName = "default
         return base.with_method(method)
     if method.endswith(HALF):
         return replace(base, train=replace(base.train, steps=max(1, base.train.steps // 2)))
-    return with_entries(base, {"model.without": [*base.model.without, method.removeprefix(WITHOUT)]})
+    part = method.removeprefix(WITHOUT)
+    if part in ENTRIES_WITHOUT:
+        return with_entries(base, ENTRIES_WITHOUT[part])
+    return with_entries(base, {"model.without": [*base.model.without, part]})
 
 
 def _check_stored(job: Job) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -17,12 +18,19 @@ ExportFormat = Literal["html", "glb", "usd", "ply", "compressed.ply", "splat", "
 Suite = Literal["phototourism"]
 HALF = "-half-steps"
 WITHOUT = "without-"
+ENTRIES_WITHOUT: Mapping[str, Mapping[str, Any]] = {
+    "stereo": {"data.use_metric_depth": False},
+    "dropout": {"train.dropout.rate": 0.0},
+    "growth": {"train.schedule.densify_every": 0},
+}
+"""Ablations of what the paper does not have: the entries of `config.yaml` that switch each part off."""
 BENCH_METHODS: tuple[str, ...] = (
     *(name for name in METHODS if name != DEFAULT_METHOD),
     DEFAULT_METHOD + HALF,
     DEFAULT_METHOD,
     *PRESET_NAMES,
     *(WITHOUT + part for part in get_args(Ablation)),
+    *(WITHOUT + part for part in ENTRIES_WITHOUT),
 )
 """Rows that a benchmark can have: methods, Wild-GS with half the steps, presets, and the ablations of Wild-GS."""
 
@@ -38,10 +46,13 @@ def reference_preset(suite: Suite | None) -> PresetName:
 def default_bench_methods(suite: Suite | None) -> tuple[str, ...]:
     """All of `BENCH_METHODS` except the preset of the row `wildgs` and ablations that do not apply to it.
 
-    The default has no 3D Wrapping, so that the ablations of its parts do not apply.
+    The default has no 3D Wrapping, so that the ablations of its parts do not apply. Stereo and dropout are used
+    only if depth maps were made or `--dropout.rate` is given, so that their rows have to be asked for. The paper's
+    suite has the paper's ablations only.
     """
-    absent = [WITHOUT + part for part in WRAPPING_PARTS] if suite is None else []
-    return tuple(name for name in BENCH_METHODS if name not in (reference_preset(suite), *absent))
+    parts = ("stereo", "dropout", *WRAPPING_PARTS) if suite is None else ENTRIES_WITHOUT
+    absent = {reference_preset(suite), *(WITHOUT + part for part in parts)}
+    return tuple(name for name in BENCH_METHODS if name not in absent)
 
 
 @dataclass(frozen=True)

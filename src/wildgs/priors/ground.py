@@ -23,6 +23,9 @@ _LEAST_SHARE = 0.2
 _LEAST_ABOVE = 0.9
 """Minimum share of the cameras above the plane."""
 _LEAST_POINTS = 50
+_NEAR_SHARE = 0.05
+"""Tolerance of the refined plane, relative to the height of the lowest cameras above it. An error of the plane by
+so much is one of the depth of the ground by as much."""
 _MAX_CELLS = 2_000_000
 """Maximum number of grid cells; in a larger grid, only cells around the cameras are considered."""
 _MAX_POINTS = 20_000  # for RANSAC; more do not improve the plane, and memory is 512 times as many numbers
@@ -87,7 +90,7 @@ def _places_around(feet: Float[Tensor, "V 2"], config: GroundConfig) -> Float[Te
 def find_ground(
     points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"], tolerance: float, generator: torch.Generator
 ) -> Float[Tensor, "3"] | None:
-    """Finds the level plane below the cameras with the most inliers (RANSAC, then least squares).
+    """Finds the level plane below the cameras with the most inliers, and refines it (see `_refined`).
 
     Returns:
         a, b and c of ``z = a x + b y + c``; None if every plane has too few inliers, or cameras lie below it.
@@ -97,24 +100,66 @@ def find_ground(
         return None
     if len(below) > _MAX_POINTS:
         below = below[torch.randperm(len(below), generator=generator)[:_MAX_POINTS]]
-    triples = below[torch.randint(len(below), (_HYPOTHESES, 3), generator=generator)].double()
+    plane = _level_plane(below, tolerance, generator)
+    if plane is None:
+        return None
+    best = _members(below, plane[None], tolerance)[0]
+    above = centers[:, 2] > _padded(centers) @ plane
+    if float(best.float().mean()) < _LEAST_SHARE or float(above.float().mean()) < _LEAST_ABOVE:
+        return None
+    return _refined(below, centers, plane, tolerance, generator)
+
+
+def _refined(
+    points: Float[Tensor, "P 3"],
+    centers: Float[Tensor, "V 3"],
+    plane: Float[Tensor, "3"],
+    tolerance: float,
+    generator: torch.Generator,
+) -> Float[Tensor, "3"]:
+    """The plane with the most inliers near a coarse one, within a tolerance that fits the cameras' height.
+
+    Steps, kerbs and plinths within the coarse tolerance raise and tilt the plane. At eye height, an error of a
+    tenth of the height already moves the ground at the feet of a photographer by a tenth of its distance.
+    """
+    heights = centers[:, 2] - _padded(centers) @ plane
+    narrow = min(tolerance, _NEAR_SHARE * float(heights.quantile(0.1)))
+    near = _lowest(points[_members(points, plane[None], 2 * tolerance)[0]], 2 * tolerance)
+    finer = _level_plane(near, narrow, generator) if narrow > 0 else None
+    if finer is None or not bool((centers[:, 2] > _padded(centers) @ finer)[heights > 0].all()):
+        return plane
+    return finer
+
+
+def _lowest(points: Float[Tensor, "P 3"], cell: float) -> Float[Tensor, "Q 3"]:
+    """The lowest point of each cell of a horizontal grid, so that a plane counts by its area."""
+    index = (points[:, :2] / cell).floor().long()
+    _, member = index.unique(dim=0, return_inverse=True)
+    order = points[:, 2].argsort(stable=True)
+    first = torch.full((int(member.max()) + 1,), len(points), dtype=torch.int64) if len(points) else member
+    first.scatter_reduce_(0, member[order], torch.arange(len(points)), "amin")
+    return points[order[first]]
+
+
+def _level_plane(
+    points: Float[Tensor, "P 3"], tolerance: float, generator: torch.Generator
+) -> Float[Tensor, "3"] | None:
+    """The level plane with the most inliers (RANSAC, then least squares); None if it has too few."""
+    triples = points[torch.randint(len(points), (_HYPOTHESES, 3), generator=generator)].double()
     rows = _padded(triples)
     usable = torch.linalg.det(rows).abs() > 1e-6
     hypotheses = torch.linalg.solve(rows[usable], triples[usable][..., 2]).float()
     hypotheses = hypotheses[hypotheses[:, :2].norm(dim=1) < _STEEPEST]
     if len(hypotheses) == 0:
         return None
-    members = _members(below, hypotheses, tolerance)
-    best = members[int(members.sum(dim=1).argmax())]
+    members = _members(points, hypotheses, tolerance)
+    best, plane = members[int(members.sum(dim=1).argmax())], None
     for _ in range(2):
         if int(best.sum()) < _LEAST_POINTS:
             return None
-        known = below[best].double()
+        known = points[best].double()
         plane = torch.linalg.lstsq(_padded(known), known[:, 2:]).solution[:, 0].float()
-        best = _members(below, plane[None], tolerance)[0]
-    above = centers[:, 2] > _padded(centers) @ plane
-    if float(best.float().mean()) < _LEAST_SHARE or float(above.float().mean()) < _LEAST_ABOVE:
-        return None
+        best = _members(points, plane[None], tolerance)[0]
     return plane
 
 

@@ -35,6 +35,8 @@ class DataConfig:
     """Use the masks in the scene's masks/ folder (0 = ignore the pixel)."""
     use_depth: bool = True
     """Use the depth maps in the scene's depth/ folder."""
+    use_metric_depth: bool = True
+    """Use those with metric depth (.tiff) too, for example by stereo."""
     max_image_pixels: int = MAX_IMAGE_PIXELS
     """Skip photos with more pixels without decoding them."""
 

@@ -73,6 +73,7 @@ def load_scene(
         ImageCache(0 if lazy else _cache_limit(image_cache)),
         use_masks=config.use_masks,
         use_depth=config.use_depth,
+        use_metric_depth=config.use_metric_depth,
         max_pixels=config.max_image_pixels,
         depth_scale=alignment.scale,
     )
@@ -89,7 +90,7 @@ def load_scene(
         alignment=alignment,
         observations=observations_of(model.observations, names, views),
     )
-    if config.use_depth and not lazy:
+    if photos.use_metric_depth and not lazy:
         refuse_other_units(scene)
     return scene
 

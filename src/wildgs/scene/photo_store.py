@@ -133,6 +133,7 @@ class ScenePhotos(PhotoStore):
         *,
         use_masks: bool = True,
         use_depth: bool = True,
+        use_metric_depth: bool = True,
         max_pixels: int = MAX_IMAGE_PIXELS,
         depth_scale: float = 1.0,
     ) -> None:
@@ -145,6 +146,7 @@ class ScenePhotos(PhotoStore):
             cache: Cache of decoded photos.
             use_masks: Whether masks/ is read.
             use_depth: Whether depth/ is read.
+            use_metric_depth: Whether this includes metric depth.
             max_pixels: Larger images are not read.
             depth_scale: Factor from units of the model to units of the scene.
         """
@@ -154,6 +156,7 @@ class ScenePhotos(PhotoStore):
         self.cache = cache
         self.use_masks = use_masks
         self.use_depth = use_depth
+        self.use_metric_depth = use_depth and use_metric_depth
         self.max_pixels = max_pixels
         self._grids: dict[str, PixelGrid] = {}
         self._depth = depth_files(root, names)
@@ -190,7 +193,7 @@ class ScenePhotos(PhotoStore):
             "content": self.images_dir / name,
             "mask": self.find_mask(name) if self.use_masks else None,
             "depth prior": self._depth[name] if self.use_depth else None,
-            "metric depth": metric_file(self._depth[name]) if self.use_depth else None,
+            "metric depth": metric_file(self._depth[name]) if self.use_metric_depth else None,
         }
         return {what: digest for what, file in files.items() if file and (digest := fingerprint(file))}
 
@@ -289,6 +292,8 @@ class ScenePhotos(PhotoStore):
         return disparity if source is None or disparity is None else sample_disparity(disparity, source)
 
     def _read_depth(self, name: str, grid: PixelGrid) -> Float32[np.ndarray, "H W"] | None:
+        if not self.use_metric_depth:
+            return None
         depth = self._read_prior(metric_file(self._depth[name]), grid, read_depth)
         if depth is None:
             return None

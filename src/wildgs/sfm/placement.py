@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -81,10 +81,18 @@ class Failure:
     Attributes:
         reason: The reason as text.
         partner: The photo with which it has the most matches, if any.
+        group: Names of the photos that show the same other place or side, itself included; empty if there are none.
     """
 
     reason: str
     partner: str | None = None
+    group: tuple[str, ...] = ()
+
+
+def other_places(failed: Iterable[Failure]) -> tuple[tuple[str, ...], ...]:
+    """The groups of photos that show another place or side than the scene, largest first."""
+    groups = {failure.group for failure in failed if failure.group}
+    return tuple(sorted(groups, key=lambda group: (-len(group), group)))
 
 
 @dataclass(frozen=True)
@@ -113,56 +121,61 @@ def failures(
         best[a] = max(best.get(a, (0, 0)), (inliers, b))
         best[b] = max(best.get(b, (0, 0)), (inliers, a))
     missing = missing_from(models[0], copies)
-    groups = _groups(missing, found)
+    together = [
+        [row for row in missing if find_registered(model, copies[row]) is not None] for model in models[1:]
+    ]
+    groups = _groups(missing, found, together)
     result = {}
     for row in missing:
         inliers, partner = best.get(row, (0, row))
-        reason = _reason(row, copies, models, findings, blank, groups, inliers, partner)
-        result[copies[row].name] = Failure(reason, copies[partner].name if inliers else None)
+        reason = _own_reason(row, copies, findings, blank)
+        group: tuple[str, ...] = ()
+        if reason is None and len(groups[row]) >= LEAST_GROUP:
+            group = tuple(sorted(copies[member].name for member in groups[row]))
+        reason = reason or _reason(copies[row], copies[partner], models[0], group, inliers)
+        result[copies[row].name] = Failure(reason, copies[partner].name if inliers else None, group)
     return result
 
 
-def _groups(missing: Sequence[int], found: Mapping[Pair, int]) -> dict[int, list[int]]:
-    """The photos without a pose that each of them is linked to by matches with each other, itself included."""
+def _groups(
+    missing: Sequence[int], found: Mapping[Pair, int], together: Iterable[Sequence[int]] = ()
+) -> dict[int, list[int]]:
+    """The photos without a pose that each of them belongs with, itself included.
+
+    They are linked by matches with each other, or are `together` in a smaller model.
+    """
     group = {row: [row] for row in missing}
-    for (a, b), inliers in found.items():
-        if inliers >= GROUP_MATCHES and a in group and b in group and group[a] is not group[b]:
+    matched = [pair for pair, inliers in found.items() if inliers >= GROUP_MATCHES]
+    for a, b in [*matched, *((rows[0], row) for rows in together for row in rows[1:])]:
+        if a in group and b in group and group[a] is not group[b]:
             group[a] += group[b]
             group |= dict.fromkeys(group[b], group[a])
     return group
 
 
-def _reason(
-    row: int,
-    copies: Sequence[WorkingCopy],
-    models: Sequence[Any],
-    findings: Findings,
-    blank: set[int],
-    groups: Mapping[int, Sequence[int]],
-    inliers: int,
-    partner: int,
-) -> str:
-    copy = copies[row]
+def _own_reason(
+    row: int, copies: Sequence[WorkingCopy], findings: Findings, blank: Collection[int]
+) -> str | None:
+    """A reason that concerns the photo itself, independent of its matches; None if there is none."""
     if row in blank:
         return "no features found (blank, blurred or very small)"
-    if copy.work_name in findings.lenses:
-        return findings.lenses[copy.work_name]
+    if copies[row].work_name in findings.lenses:
+        return findings.lenses[copies[row].work_name]
     if row in findings.crops:
         return f"a copy or crop of {copies[findings.crops[row]].name}, which has no pose"
-    other = next((model for model in models[1:] if find_registered(model, copy) is not None), None)
-    members = [r for r in groups[row] if r != row]
-    if other is not None and other.num_reg_images() > len(members):
-        members = [r for r, c in enumerate(copies) if r != row and find_registered(other, c) is not None]
-    if len(members) + 1 >= LEAST_GROUP:
-        names = ", ".join(copies[r].name for r in sorted(members)[:3])
+    return None
+
+
+def _reason(copy: WorkingCopy, partner: WorkingCopy, model: Any, group: Sequence[str], inliers: int) -> str:
+    """The reason by matches: the photo's group, or the partner with which it has the most matches."""
+    if group:
+        names = ", ".join([name for name in group if name != copy.name][:3])
         return (
-            f"belongs to a separate group of {len(members) + 1} photos (with {names}) with too few matches to the"
+            f"belongs to a separate group of {len(group)} photos (with {names}) with too few matches to the"
             " scene, because they show another side or another place; photos taken in between would connect them"
         )
     if inliers == 0:
         return "matches no other photo"
-    if find_registered(models[0], copies[partner]) is None:
-        return (
-            f"the photo that it matches best, {copies[partner].name} ({inliers} matches), has no pose either"
-        )
-    return f"too few matches with the scene ({inliers} at most, with {copies[partner].name})"
+    if find_registered(model, partner) is None:
+        return f"the photo that it matches best, {partner.name} ({inliers} matches), has no pose either"
+    return f"too few matches with the scene ({inliers} at most, with {partner.name})"

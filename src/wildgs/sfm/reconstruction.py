@@ -26,7 +26,7 @@ from wildgs.sfm.mapping import find_registered, quiet
 from wildgs.sfm.match_pictures import FOLDER as PICTURES
 from wildgs.sfm.match_pictures import write_match_pictures
 from wildgs.sfm.passes import find_poses
-from wildgs.sfm.placement import failures, placements
+from wildgs.sfm.placement import failures, other_places, placements
 from wildgs.sfm.report import REPORT_NAME, SfmReport, read_masks
 from wildgs.sfm.upright import JPEG_QUALITY, WorkingCopy, copy_upright
 from wildgs.sfm.workplace import Workplace, open_workplace
@@ -110,6 +110,7 @@ def _reconstruct(
             pairing=poses.pairing.name,
             pairs=len(poses.pairing.pairs),
             models=tuple(other.num_reg_images() for other in poses.models),
+            other_places=other_places(without.values()),
             seconds=time.perf_counter() - started,
             renamed={c.name: c.scene_name for c in copies if _is_renamed(c)},
             masks=_files_in(work.scene / "masks"),

@@ -38,6 +38,8 @@ class SfmReport:
         pairs: Number of matched pairs.
         models: Sizes of all models, largest first; the first is kept.
         seconds: Computing time.
+        other_places: Groups of photos without a pose that show another place, or another side of this one, largest
+            first.
         placed: Reliability of each pose, by name in the scene.
         copies: Originals of copies and crops, by name.
         doubtful: Reasons why poses are doubtful, by name.
@@ -53,6 +55,7 @@ class SfmReport:
     pairs: int
     models: tuple[int, ...]
     seconds: float
+    other_places: tuple[tuple[str, ...], ...] = ()
     renamed: Mapping[str, str] = field(default_factory=dict)
     masks: tuple[str, ...] = ()
     placed: Mapping[str, Placement] = field(default_factory=dict)
@@ -82,7 +85,17 @@ class SfmReport:
             text.append(
                 f"{len(self.left_out)} photos have no pose and are not used; the others are not affected:"
             )
-            text += [f"  {printable(name)}: {reason}" for name, reason in sorted(self.left_out.items())]
+            grouped = {name for group in self.other_places for name in group}
+            text += [
+                f"  {len(group)} photos form another place, or another side of this one: {_some(group)};"
+                " reconstruct them in a folder of their own, or add photos taken in between"
+                for group in self.other_places
+            ]
+            text += [
+                f"  {printable(name)}: {reason}"
+                for name, reason in sorted(self.left_out.items())
+                if name not in grouped
+            ]
         if self.renamed:
             text.append(f"{len(self.renamed)} photos have other names in the scene:")
             text += [f"  {printable(name)}: {renamed}" for name, renamed in sorted(self.renamed.items())]
