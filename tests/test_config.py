@@ -91,7 +91,9 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert train["objective"].pop("mask_power") > 1
     assert train["objective"].pop("sky_weight") > 0
     assert train["density"].pop("min_visibility") > 0.5
+    del model["camera_response"]
     config = from_plain(RunConfig, plain)
+    assert not config.model.camera_response.fits
     assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
     assert config.model.eps2d == 0.3  # with which its Gaussians were trained
     assert config.model.local_embeddings

@@ -7,6 +7,7 @@ from typing import Any
 
 EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "matched_loss"): ("color_match", 0.0),
+    ("model", "camera_response"): ("color_match", {"vignetting": False, "curve": False}),
     ("model", "light_codes"): ("color_match", 0),
     ("model", "light_components"): ("color_match", 0),
     ("model", "local_embeddings"): ("wrapping", True),

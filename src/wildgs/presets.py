@@ -42,6 +42,8 @@ _PAPER: dict[str, Any] = {
     "model.sky.points": 0,
     "model.sky.densify": True,
     "model.color_match": False,
+    "model.camera_response.vignetting": False,
+    "model.camera_response.curve": False,
     "model.light_codes": 0,
     "model.light_components": 0,
     "model.matched_loss": 0.0,

@@ -31,6 +31,7 @@ class Painter(Method):
         self.gaussians = Gaussians(geometry_from_points(torch.rand(7, 3)))
         self.painting = paint
         self.mask = mask
+        self.responds = False
         self.shown: list[tuple[torch.Tensor, Camera]] = []
         self.keeps: list[torch.Tensor | None] = []
 
@@ -51,7 +52,8 @@ class Painter(Method):
         assert not torch.is_grad_enabled()
         self.shown.append((photo, camera))
         self.keeps.append(keep)
-        return Appearance(visibility=self.visibility(photo))
+        response = photo.mean(dim=(0, 1)) if self.responds else None
+        return Appearance(visibility=self.visibility(photo), response=response)
 
     def visibility(self, photo):
         assert not torch.is_grad_enabled()
@@ -63,8 +65,10 @@ class Painter(Method):
     def training_pass(self, photo, camera, stage: Stage, keep=None, *, name=None) -> TrainingOutput:
         raise AssertionError("evaluation must not train")
 
-    def render(self, camera, sh, *, background=None):
+    def render(self, camera, sh, *, background=None, response=None):
         colors = self.painting(self.shown[-1][0])
+        if response is not None:
+            colors = colors * response
         assert colors.shape == (camera.height, camera.width, 3)
         return Rendering(colors, torch.ones(H, W), torch.ones(H, W))
 
@@ -145,6 +149,17 @@ def test_half_does_not_depend_on_the_right_half(tmp_path):
         evaluate(method, scene(view("a.jpg", photo=photo)), "half", tmp_path / str(i), step=1)
         renders.append(read(tmp_path / str(i) / "eval/half/a.png"))
     assert torch.equal(renders[0], renders[1])
+
+
+@pytest.mark.parametrize("protocol", ["full", "half"])
+def test_the_cameras_response_of_what_is_seen_is_part_of_the_render(tmp_path, protocol):
+    photo = torch.full((H, W, 3), 51, dtype=torch.uint8)
+    photo[:, W // 2 :] = 255
+    method = Painter(lambda seen: torch.ones(H, W, 3))
+    method.responds = True
+    evaluate(method, scene(view("a.png", photo=photo)), protocol, tmp_path, step=1)
+    render = np.asarray(Image.open(tmp_path / "eval" / protocol / "a.png"))
+    assert (render == 51).all() if protocol == "half" else (render > 100).all()
 
 
 def test_metrics_file_holds_what_the_design_names(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from wildgs.errors import UserError
 from wildgs.light.look import look_of, mix, own_look
 from wildgs.light.photos import encode_picture, encode_view
 from wildgs.light.saved import load_look, save_look
+from wildgs.model.config import CameraResponseConfig
 
 
 @pytest.fixture
@@ -32,6 +34,25 @@ def test_round_trip(method, look, tmp_path: Path) -> None:
     assert look.embeddings.color_map.any()
     assert torch.equal(back.embeddings.color_map, look.embeddings.color_map)
     assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+def test_a_cameras_response_is_mixed_and_saved_and_neutral_has_none(
+    method, wall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted = CameraResponseConfig(vignetting=True, curve=True)
+    monkeypatch.setattr(method, "config", replace(method.config, camera_response=fitted))
+    monkeypatch.setattr(method.photo_match, "config", method.config)
+    looks = [look_of(method, encode_view(method, view), view.name) for view in wall.views[:2]]
+    responses = [look.embeddings.response for look in looks]
+    mixed = mix(looks, [0.25, 0.75])
+    torch.testing.assert_close(mixed.embeddings.response, 0.25 * responses[0] + 0.75 * responses[1])
+    assert mixed.embeddings.response.any()
+    back = load_look(method, save_look(mixed, tmp_path / "a.safetensors"))
+    assert torch.equal(back.embeddings.response, mixed.embeddings.response)
+    assert method.mean([look.embeddings for look in looks], 2).response is None
+    monkeypatch.setattr(method, "config", replace(method.config, camera_response=CameraResponseConfig()))
+    with pytest.raises(UserError):
+        load_look(method, tmp_path / "a.safetensors")
 
 
 def test_only_gaussians_inside_the_box_are_stored(method, look, tmp_path: Path) -> None:

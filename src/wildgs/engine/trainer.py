@@ -193,7 +193,9 @@ class Trainer:
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
             static = self._static_pixels(output, keep, sky)
-            seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, static)
+            seen = SeenView(
+                output.projection, output.rendering.colors, output.painted, photo, static, output.developed
+            )
             seen = self.density.before_backward(seen)
         skipped = self._report_marked()
         if self.density.perturbs:
@@ -288,7 +290,7 @@ class Trainer:
             self.config.objective,
             self.schedule.progress(self.step),
             photo,
-            output.rendering.colors,
+            output.picture,
             visibility=output.visibility,
             keep=keep,
             depth=output.rendering.depth,

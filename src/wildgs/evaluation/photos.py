@@ -25,6 +25,7 @@ from wildgs.evaluation.metrics import MAX_PSNR
 from wildgs.evaluation.pictures import write_json
 from wildgs.files import read_json
 from wildgs.model.appearance import Appearance
+from wildgs.model.camera_response import responded, squared_radius
 from wildgs.model.method import Method
 from wildgs.rasterize import blend
 from wildgs.scene.scene import Scene, View, observed_pixels
@@ -154,6 +155,8 @@ def _inspect(
     small = functional.interpolate(pictures, (height, width), mode="bilinear", antialias=True)[0]
     projection = method.gaussians.project(view.camera.resized(width, height).to(device))
     colors = blend(projection, method.paint(projection, appearance, method.sh_degree)).colors
+    if appearance.response is not None:
+        colors = responded(colors, squared_radius(projection.camera), appearance.response)
     error = (colors.nan_to_num().clamp(0, 1).permute(2, 0, 1) - small[:3]).square().mean(dim=0)
     weights, psnr, structure = small[3], None, 0.0
     if float(weights.mean()) >= LEAST_SHOWN:

@@ -127,8 +127,9 @@ def evaluate(
     scores: list[ImageScore] = []
 
     def score(view: View) -> tuple[ImageScore, _Notes, Tensor | None]:
-        own, sh = _Notes(), _shade(method, view, protocol, device)
-        render = _render(method, view, sh, own)
+        own = _Notes()
+        sh, response = _shade(method, view, protocol, device)
+        render = _render(method, view, sh, response, own)
         write_picture(folder / paths[view.name], render)
         found = _score_view(view, render, protocol, observed, lpips, own)
         return found, own, sh if view is scene.test_views[-1] else None
@@ -164,18 +165,27 @@ def evaluate(
     return content
 
 
-def _shade(method: Method, view: View, protocol: Protocol, device: torch.device) -> Float[Tensor, "N K 3"]:
-    """Spherical harmonics under the appearance of the part of the photo that the protocol allows."""
+def _shade(
+    method: Method, view: View, protocol: Protocol, device: torch.device
+) -> tuple[Float[Tensor, "N K 3"], Float[Tensor, " Q"] | None]:
+    """Spherical harmonics and camera response of the part of the photo that the protocol allows."""
     (photo, keep), camera = view.load(device), view.camera.to(device)
     if protocol == "half":
         half = photo.shape[1] // 2
         photo, camera = photo[:, :half].contiguous(), camera.cropped(0, 0, half, camera.height)
         keep = None if keep is None else keep[:, :half].contiguous()
-    return method.shade(method.encode(photo, camera, keep))
+    appearance = method.encode(photo, camera, keep)
+    return method.shade(appearance), appearance.response
 
 
-def _render(method: Method, view: View, sh: Float[Tensor, "N K 3"], notes: _Notes) -> UInt8[Tensor, "H W 3"]:
-    colors = method.render(view.camera.to(sh.device), sh).colors
+def _render(
+    method: Method,
+    view: View,
+    sh: Float[Tensor, "N K 3"],
+    response: Float[Tensor, " Q"] | None,
+    notes: _Notes,
+) -> UInt8[Tensor, "H W 3"]:
+    colors = method.render(view.camera.to(sh.device), sh, response=response).colors
     if not colors.isfinite().all():
         notes.add(f"{view.name}: the render contains non-finite values, scored as black")
     return to_8bit(colors)

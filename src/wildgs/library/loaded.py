@@ -105,7 +105,8 @@ class LoadedScene:
 
         Args:
             camera: A camera in the aligned frame, like those of `views`.
-            look: From `appearance` or `mix`. Its first use computes all colours; further renders are plain 3DGS.
+            look: From `appearance` or `mix`. Its first use computes all colours; further renders are plain 3DGS,
+                with the response of the photo's camera if the run fits one.
 
         Raises:
             UserError: The look belongs to another run.
@@ -113,7 +114,9 @@ class LoadedScene:
         method = self.run.method
         if look.method is not method:
             raise UserError(f"the appearance {look.name!r} belongs to another run; obtain it from this one")
-        return to_8bit(method.render(camera, look.sh, depth=False).colors).cpu()
+        return to_8bit(
+            method.render(camera, look.sh, depth=False, response=look.embeddings.response).colors
+        ).cpu()
 
     def frames(
         self, cameras: Sequence[Camera], looks: Look | Sequence[Look] | Timeline

@@ -241,7 +241,7 @@ def _example(
     method = shown.run.method
     camera = view.camera.to(method.gaussians.means.device)
     appearance = shown.encode(view)
-    rendering = method.render(camera, method.shade(appearance))
+    rendering = method.render(camera, method.shade(appearance), response=appearance.response)
     depth = torch.where(rendering.alpha > 0.5, rendering.depth, 0.0)
     visibility = appearance.visibility
     mask = torch.ones_like(depth) if visibility is None else visibility

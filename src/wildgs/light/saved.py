@@ -81,6 +81,8 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
         tensors["color_map"] = embeddings.color_map.detach().cpu().contiguous()
     if embeddings.basis_weights is not None:
         tensors["basis_weights"] = embeddings.basis_weights.detach().cpu().contiguous()
+    if embeddings.response is not None:
+        tensors["response"] = embeddings.response.detach().cpu().contiguous()
     if embeddings.local_embeddings is None:
         return tensors
     local = embeddings.local_embeddings.detach().cpu()
@@ -106,8 +108,11 @@ def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     weights = tensors.get("basis_weights")
     if weights is not None and weights.shape != (method.basis_size,):
         raise ValueError("basis weights of another length")
+    response = tensors.get("response")
+    if response is not None and response.shape != (method.response_size,):
+        raise ValueError("a camera response of another length")
     local = _local_embeddings(method, tensors) if method.local_size else None
-    parts = (common, local, color_map, weights)
+    parts = (common, local, color_map, weights, response)
     if not all(bool(values.isfinite().all()) for values in parts if values is not None):
         raise ValueError("embeddings that are not finite")
     return Embeddings(*(None if values is None else values.float().to(device) for values in parts))  # type: ignore[arg-type]

@@ -20,6 +20,7 @@ class Appearance:
         visibility: Mask M of the photo (1 = static); None for a method without a mask.
         color_map: Colour transform that corrects the embedding (`wildgs.model.color_match`), or None.
         basis_weights: Weights that correct both (`wildgs.model.light_basis`), or None.
+        response: Response of the photo's camera (`wildgs.model.camera_response`), or None.
     """
 
     global_embedding: Float[Tensor, " G"] | None = None
@@ -27,6 +28,7 @@ class Appearance:
     visibility: Float[Tensor, "H W"] | None = None
     color_map: Float[Tensor, "3 M"] | None = None
     basis_weights: Float[Tensor, " B"] | None = None
+    response: Float[Tensor, " Q"] | None = None
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,15 @@ class Embeddings:
         color_map: Colour transform [A | b] of all Gaussians, ``c + A c + b``, possibly with further columns for
             light codes and the sky (`wildgs.model.color_match.match_photo`), or None.
         basis_weights: Weights of the components of `wildgs.model.light_basis`, or None.
+        response: Response of the camera, applied to pixels, not to Gaussians (`wildgs.model.camera_response`); None
+            is the identity.
     """
 
     global_embedding: Float[Tensor, " G"]
     local_embeddings: Float[Tensor, "N L"] | None = None
     color_map: Float[Tensor, "3 M"] | None = None
     basis_weights: Float[Tensor, " B"] | None = None
+    response: Float[Tensor, " Q"] | None = None
 
 
 def blend_embeddings(
@@ -52,7 +57,7 @@ def blend_embeddings(
 ) -> Embeddings:
     """Appearance tuning: Σ w_k f_k on embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
 
-    Colour maps and basis weights are mixed like global embeddings.
+    Colour maps, basis weights and camera responses are mixed like global embeddings.
 
     Args:
         parts: Embeddings for the same Gaussians, at least one.
@@ -66,13 +71,14 @@ def blend_embeddings(
         _weighted(local, local_weights) if local else None,
         _mixed([part.color_map for part in parts], weights),
         _mixed([part.basis_weights for part in parts], weights),
+        _mixed([part.response for part in parts], weights),
     )
 
 
 def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
     """The mean of `count` embeddings, of which only one is in memory at a time.
 
-    Colour maps and basis weights are averaged over the parts that have them.
+    Colour maps and basis weights are averaged over the parts that have them. The mean has no camera response.
     """
     total_global, maps, basis, local_mean = [], [], [], None
     for part in parts:

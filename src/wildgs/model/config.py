@@ -215,6 +215,24 @@ class WildGSRates:
 
 
 @dataclass(frozen=True)
+class CameraResponseConfig:
+    """The camera's response beside exposure and white balance (`wildgs.model.camera_response`). Not in the paper.
+
+    Attributes:
+        vignetting: Fit a gain that depends on the distance from the optical axis to every photo.
+        curve: Fit a tone curve per channel to every photo.
+    """
+
+    vignetting: bool = False
+    curve: bool = False
+
+    @property
+    def fits(self) -> bool:
+        """Whether anything is fitted."""
+        return self.vignetting or self.curve
+
+
+@dataclass(frozen=True)
 class WildGSConfig:
     """Wild-GS.
 
@@ -233,6 +251,7 @@ class WildGSConfig:
             photo, and apply it to the scene's colours. Not in the paper.
         matched_loss: Fraction of the colour match that is applied to a training render before the loss, 0 to 1. Not
             in the paper.
+        camera_response: Vignetting and tone curve of a photo, fitted after the colour match. Not in the paper.
         light_codes: Light codes per Gaussian, linear in its intrinsic feature, by which a photo's colour transform
             varies over the scene; 0 = none. Not in the paper.
         light_components: Components of the light basis in which a photo's light is fitted after the colour match
@@ -253,6 +272,7 @@ class WildGSConfig:
     sky: SkyConfig = field(default_factory=SkyConfig)
     color_match: bool = True
     matched_loss: float = 0.8
+    camera_response: CameraResponseConfig = field(default_factory=CameraResponseConfig)
     light_codes: int = 8
     light_components: int = 32
     eps2d: float = 0.1

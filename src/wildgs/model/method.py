@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from jaxtyping import Bool, Float, Int, UInt8
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings, mean_embeddings
+from wildgs.model.camera_response import responded, squared_radius
 from wildgs.model.config import InitialConfig, LearningRate, MemoryUse
 from wildgs.model.gaussians import Gaussians, rows_to_shade, spread_rows, take_rows
 from wildgs.model.initial import InitialGaussians, initial_from_points
@@ -69,6 +71,11 @@ class Method(nn.Module, ABC):
     @property
     def basis_size(self) -> int:
         """Number of basis weights of an appearance; 0 for a method that fits none."""
+        return 0
+
+    @property
+    def response_size(self) -> int:
+        """Length of the camera response of an appearance; 0 for a method that fits none."""
         return 0
 
     # Declarations.
@@ -281,6 +288,7 @@ class Method(nn.Module, ABC):
         background: Float[Tensor, " 3"] | None = None,
         sh_degree: int | None = None,
         depth: bool = True,
+        response: Float[Tensor, " Q"] | None = None,
     ) -> Rendering:
         """Rasterises the Gaussians with given harmonics, as in plain 3DGS.
 
@@ -290,10 +298,14 @@ class Method(nn.Module, ABC):
             background: Background colour; None is black.
             sh_degree: Evaluated degree of the harmonics; None takes all.
             depth: Whether the expected depth is rendered too.
+            response: Response of a photo's camera, applied to the pixels; None is the identity.
         """
         means = self.gaussians.means
         camera = camera.to(means.device)
         projection = self.gaussians.project(camera)
         degree = self.sh_degree if sh_degree is None else sh_degree
         colors = sh_to_colors(means, sh, camera, degree=degree, visible=projection.visible)
-        return blend(projection, colors, background=background, depth=depth)
+        rendering = blend(projection, colors, background=background, depth=depth)
+        if response is None:
+            return rendering
+        return replace(rendering, colors=responded(rendering.colors, squared_radius(camera), response))

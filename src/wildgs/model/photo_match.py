@@ -14,6 +14,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.geometry.camera import Camera
+from wildgs.model.camera_response import (
+    ROUNDS,
+    TRAINING_ROUNDS,
+    fit_response,
+    responded,
+    squared_radius,
+    static_weights,
+)
 from wildgs.model.color_match import (
     SKY_COLUMNS,
     changed_harmonics,
@@ -24,6 +32,7 @@ from wildgs.model.color_match import (
 from wildgs.model.config import WildGSConfig
 from wildgs.model.gaussians import Gaussians, spread_rows
 from wildgs.model.sky import Sky, find_sky, sine_of_elevation
+from wildgs.model.wrapping import liftable
 from wildgs.rasterize import Projection, Rendering, blend, blend_sample
 
 MATCH_TILES, MATCH_EVERY = 40, 3
@@ -244,6 +253,34 @@ class PhotoMatch(nn.Module):
             sky: Which of them are sky; from `sky`.
         """
         return changed_harmonics(harmonics, change, sky, self.light_codes(intrinsic))
+
+    @torch.no_grad()
+    def response(self, sight: Sight, rendering: Rendering, *, training: bool = False) -> Tensor:
+        """The camera's response that remains between a matched render and its photo, without gradient.
+
+        Args:
+            sight: The photo.
+            rendering: The render of its camera under its appearance.
+            training: Whether to read a sample of the pixels, in fewer iterations.
+        """
+        part = (slice(None, None, MATCH_EVERY),) * 2 if training else (...,)
+        visibility, keep = (None if x is None else x[part] for x in (sight.visibility, sight.keep))
+        static = liftable(visibility, rendering.alpha[part], self.config.mask_threshold)
+        return fit_response(
+            self.config.camera_response,
+            rendering.colors[part],
+            sight.photo[part],
+            squared_radius(sight.projection.camera)[part],
+            static_weights(static, visibility, keep),
+            rounds=TRAINING_ROUNDS if training else ROUNDS,
+        )
+
+    def developed(self, sight: Sight, rendering: Rendering) -> Float[Tensor, "H W 3"] | None:
+        """A training render with the response of the photo's camera, as far as `matched_loss` says."""
+        if not self.config.camera_response.fits:
+            return None
+        response = self.config.matched_loss * self.response(sight, rendering, training=True)
+        return responded(rendering.colors, squared_radius(sight.projection.camera), response)
 
 
 def _resized(values: Float[Tensor, "H W *C"], height: int, width: int) -> Float[Tensor, "h w *C"]:

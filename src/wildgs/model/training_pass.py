@@ -46,12 +46,19 @@ class TrainingOutput:
         projection: Projection of the Gaussians, whose statistics densification uses.
         visibility: M; None for a method without a mask.
         painted: Colours of the Gaussians that were blended.
+        developed: The render with the response of the photo's camera, which the loss compares; None without one.
     """
 
     rendering: Rendering
     projection: Projection
     visibility: Float[Tensor, "H W"] | None
     painted: Float[Tensor, "N 3"]
+    developed: Float[Tensor, "H W 3"] | None = None
+
+    @property
+    def picture(self) -> Float[Tensor, "H W 3"]:
+        """The render that is compared with the photo."""
+        return self.rendering.colors if self.developed is None else self.developed
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
+from wildgs.model.camera_response import RESPONSE_SIZE
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.dropout import opacity_factors
 from wildgs.model.encoder import Encoder, encoder_of
@@ -153,6 +154,11 @@ class WildGS(Method):
         return 0 if self.light_basis.components is None else len(self.light_basis.components)
 
     @property
+    def response_size(self) -> int:
+        """Length of a camera response."""
+        return RESPONSE_SIZE if self.config.color_match and self.config.camera_response.fits else 0
+
+    @property
     def _wraps(self) -> bool:
         return self.config.local_embeddings and not self._lacks("local")
 
@@ -208,7 +214,12 @@ class WildGS(Method):
             values = torch.cat([colors, codes], dim=1)
             picture = self.photo_match.picture(sight.projection, values, self._centre)
             change = self.photo_match.find(sight, picture)
-        return self.light_basis.fit(self, sight, replace(appearance, color_map=change))
+        appearance = self.light_basis.fit(self, sight, replace(appearance, color_map=change))
+        if not self.response_size:
+            return appearance
+        with torch.no_grad():
+            rendering = blend(sight.projection, self.paint(sight.projection, appearance, self.sh_degree))
+        return replace(appearance, response=self.photo_match.response(sight, rendering))
 
     @property
     def _centre(self) -> Float[Tensor, " 3"]:
@@ -280,7 +291,13 @@ class WildGS(Method):
         """Embeddings of Gaussians with the given centres."""
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
-        return Embeddings(appearance.global_embedding, local, appearance.color_map, appearance.basis_weights)
+        return Embeddings(
+            appearance.global_embedding,
+            local,
+            appearance.color_map,
+            appearance.basis_weights,
+            appearance.response,
+        )
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
         """Spherical harmonics sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) of the given Gaussians, plus the light basis."""
@@ -341,13 +358,15 @@ class WildGS(Method):
         harmonics = self.fusion.by_region(appearance.global_embedding, local, *inputs)
         matched = bool(self.config.color_match and self.config.matched_loss)
         colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
+        sight = Sight(photo, projection, appearance.visibility, keep)
         if matched:
-            sight = Sight(photo, projection, appearance.visibility, keep)
             colors = self.photo_match.matched(
                 colors, regions[0], means[landmark:], rows, self.num_gaussians, sight, self._centre
             ).clamp_min(0)
         colors = spread_rows(colors, rows, self.num_gaussians)
-        return TrainingOutput(blend(projection, colors), projection, appearance.visibility, colors)
+        rendering = blend(projection, colors)
+        developed = self.photo_match.developed(sight, rendering) if matched else None
+        return TrainingOutput(rendering, projection, appearance.visibility, colors, developed)
 
     def _rows_to_shade(self, visible: Bool[Tensor, " N"]) -> tuple[Int[Tensor, " V"], int]:
         """Rows of the landmark's visible Gaussians followed by those of the sky, and the number of the former."""

@@ -46,10 +46,11 @@ class SeenView:
 
     Attributes:
         projection: Projection of the Gaussians, after the backward pass.
-        colors: The render.
+        colors: The blended colours.
         painted: Colours of the Gaussians, of which `colors` is blended.
         photo: RGB in [0, 1].
         counts: Mask of the photo's pixels that are neither transient nor masked by the user; None for all.
+        picture: The render that is compared with the photo, if it is not `colors`.
         blended: What `DensityControl.before_backward` computed: for each Gaussian sums over pixels, weighted by its
             share of the pixel; defined by the strategy.
     """
@@ -59,12 +60,14 @@ class SeenView:
     painted: Float[Tensor, "N 3"]
     photo: Float[Tensor, "H W 3"]
     counts: Bool[Tensor, "H W"] | None = None
+    picture: Float[Tensor, "H W 3"] | None = None
     blended: Float[Tensor, "N S"] | None = None
 
     @property
     def error(self) -> Float[Tensor, "H W"]:
         """Absolute error of the render, mean over the channels; 0 at masked pixels."""
-        error = (self.colors.detach() - self.photo).abs().mean(dim=-1)
+        picture = self.colors if self.picture is None else self.picture
+        error = (picture.detach() - self.photo).abs().mean(dim=-1)
         return error if self.counts is None else torch.where(self.counts, error, 0.0)
 
 
