@@ -2,10 +2,10 @@
 # Runs the CPU kernels' tests as programs for 64-bit ARM under QEMU, on a Debian or Ubuntu machine of another kind.
 #
 #     apt install qemu-user-static mmdebstrap
-#     benchmarks/arm.sh [--folder DIR] [PYTEST ARGUMENTS...]                    tests/rasterize if there are none
+#     benchmarks/arm.sh [--folder DIR] [TESTS] [OPTIONS OF PYTEST]              tests/rasterize, if no TESTS are named first
 #     QEMU_CPU=neoverse-n1 NUMBA_CPU_NAME=neoverse-n1 benchmarks/arm.sh         that processor, and kernels for it
 #
-# The first call makes DIR (arm-emulated): a Python of the distribution's, extracted for arm64, and wheels for it, 1.3 GB.
+# The first call makes DIR (arm-emulated): a Python of the distribution's, extracted for arm64, and wheels for it, 1.2 GB.
 # Without NUMBA_CPU_NAME the kernels are compiled for any ARMv8 processor: LLVM finds out about this machine's
 # processor from /proc/cpuinfo, which QEMU 7 does not emulate. Compiled kernels stay in DIR/kernels.
 # pycolmap has no wheels for Linux on ARM. A stand-in lets the tests be imported, but what needs pycolmap fails.
@@ -37,7 +37,8 @@ if [ ! -e "$folder/complete" ]; then
     fetch+=(--platform "${platform}_aarch64")
   done
   "${fetch[@]}" 'numba>=0.61,<0.69' numpy scipy pillow safetensors filelock jaxtyping beartype pyyaml tqdm transformers tyro \
-    rich pytest pytest-timeout pytest-xdist hypothesis sympy networkx jinja2 fsspec setuptools
+    rich pytest pytest-timeout pytest-xdist hypothesis sympy networkx jinja2 fsspec setuptools \
+    tensorboard
   # Alone, because pip reads its dependencies as those of this machine. From 2.11 on, it needs CUDA.
   "${fetch[@]}" --no-deps 'torch>=2.8,<2.11'
   cat >"$folder/site/pycolmap.py" <<'END'
@@ -49,7 +50,7 @@ END
   touch "$folder/complete"
 fi
 
-[ $# -gt 0 ] || set -- tests/rasterize
+[[ ${1:--} != -* ]] || set -- tests/rasterize "$@"
 cd "$source"
 export QEMU_LD_PREFIX=$folder/root PYTHONPATH=$folder/site:$source/src PYTHONPYCACHEPREFIX=$folder/bytecode
 export NUMBA_CACHE_DIR=$folder/kernels PYTHONNOUSERSITE=1
