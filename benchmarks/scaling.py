@@ -57,15 +57,16 @@ class Row:
 
 
 def time_steps(trainer: Trainer, count: int) -> float:
-    """Median milliseconds of a step; the first ones warm up."""
+    """Median milliseconds of a step, once every photo has been seen: its features are computed once and kept."""
     times, rhythm = [], trainer.config.schedule.encoder_every
-    for index in range(count + 2):
+    warm_up = -(-len(trainer.views) // (rhythm * trainer.team.size)) + 1
+    for index in range(count + warm_up):
         start = time.perf_counter()
         for _ in range(rhythm):
             trainer.advance()
         if trainer.device.type == "cuda":
             torch.cuda.synchronize()
-        if index >= 2:
+        if index >= warm_up:
             times.append(1e3 * (time.perf_counter() - start) / rhythm)
     return median(times)
 
@@ -74,8 +75,10 @@ def time_exchange(trainer: Trainer, count: int) -> tuple[float, float]:
     """Median milliseconds of the exchange once all processes are there, and its megabytes."""
     view = trainer.feed.next_view()
     photo, keep = trainer.feed.photo(view)
-    output, losses = trainer._forward(view, photo, keep)
-    seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, keep)
+    sky = trainer._sky(view)
+    output, losses = trainer._forward(view, photo, keep, sky)
+    static = trainer._static_pixels(output, keep, sky)
+    seen = SeenView(output.projection, output.rendering.colors, output.painted, photo, static)
     seen = trainer.density.before_backward(seen)
     losses.total.backward()
     statistics = trainer.density.measure(seen)
