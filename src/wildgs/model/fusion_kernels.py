@@ -171,6 +171,15 @@ def write_rows(source, padded, out, width, first, count):
 
 
 @njit(nogil=True)
+def hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bias, one, two, hidden):
+    """The activations of both hidden layers for a chunk, into `one` and `two`."""
+    layer(x, padded_inputs, inputs, first, first_bias, one, hidden)
+    rectify(one)
+    layer(one, hidden, hidden, second, second_bias, two, hidden)
+    rectify(two)
+
+
+@njit(nogil=True)
 def layers_forward(counter, rows, inputs, padded_inputs, hidden, outputs, padded_outputs,
                    first, first_bias, second, second_bias, last, last_bias, direct, out):  # fmt: skip
     """See `fusion_layers.FusedLayers`. Weights are transposed, [inputs, outputs]; `direct` is empty without D."""
@@ -184,10 +193,7 @@ def layers_forward(counter, rows, inputs, padded_inputs, hidden, outputs, padded
         for at in range(begin, min(begin + PART, n), CHUNK):
             count = min(CHUNK, n - at)
             read_rows(rows, inputs, at, count, x, padded_inputs)
-            layer(x, padded_inputs, inputs, first, first_bias, one, hidden)
-            rectify(one)
-            layer(one, hidden, hidden, second, second_bias, two, hidden)
-            rectify(two)
+            hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bias, one, two, hidden)
             layer(two, hidden, hidden, last, last_bias, y, padded_outputs)
             if direct.size > 0:
                 add_layer(x, padded_inputs, inputs, direct, y, padded_outputs)
@@ -233,10 +239,7 @@ def layers_backward(counter, rows, gradient, inputs, padded_inputs, hidden, outp
             count = min(CHUNK, n - at)
             read_rows(rows, inputs, at, count, x, padded_inputs)
             read_rows(gradient, outputs, at, count, y, padded_outputs)
-            layer(x, padded_inputs, inputs, first, first_bias, one, hidden)
-            rectify(one)
-            layer(one, hidden, hidden, second, second_bias, two, hidden)
-            rectify(two)
+            hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bias, one, two, hidden)
             layer(y, padded_outputs, outputs, last_back, zeros, of_two, hidden)
             close_gate(of_two, two)
             layer(of_two, hidden, hidden, second_back, zeros, of_one, hidden)
