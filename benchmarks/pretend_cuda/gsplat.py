@@ -67,8 +67,10 @@ class StandIn:
     def fully_fused_projection(
         self, means: Tensor, _: None, quats: Tensor, scales: Tensor, view: Tensor, K: Tensor,
         width: int, height: int, *, eps2d: float, near_plane: float, packed: bool, opacities: Tensor,
+        calc_compensations: bool,
     ) -> Any:  # fmt: skip
-        """Radii, centres, depths and conics."""
+        """Radii, centres, depths and conics; opacities are not compensated."""
+        assert not calc_compensations
         assert isinstance(view, Pretended)
         assert isinstance(K, Pretended)
         camera = Camera(view.inner[0].clone(), K.inner[0].clone(), width, height)

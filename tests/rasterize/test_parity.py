@@ -24,6 +24,7 @@ class Case:
     colors: Tensor
     camera: Camera
     eps2d: float = 0.3
+    antialiased: bool = False
 
     def inputs(self) -> list[Tensor]:
         return [self.means, self.quats, self.scales, self.opacities, self.colors]
@@ -64,7 +65,14 @@ def render(case: Case, backend: str, dtype: torch.dtype) -> tuple[Projection, Re
     inputs = [t.detach().clone().to(device, dtype).requires_grad_() for t in case.inputs()]
     channels = case.colors.shape[1]
     background = torch.linspace(0.2, 0.8, channels).to(device, dtype).detach().requires_grad_()
-    projection = project(*inputs[:4], case.camera.to(device), backend=backend, absgrad=True, eps2d=case.eps2d)
+    projection = project(
+        *inputs[:4],
+        case.camera.to(device),
+        backend=backend,
+        absgrad=True,
+        eps2d=case.eps2d,
+        antialiased=case.antialiased,
+    )
     projection.means2d.retain_grad()
     rendering = blend(projection, inputs[4], background=background)
     g = torch.Generator().manual_seed(9)
@@ -132,6 +140,26 @@ def test_tiny_to_huge(backend: str, size: float):
 def test_more_and_less_of_a_blur(backend: str, eps2d: float):
     case = random_case(200, 48, 48, size=0.01)
     case.eps2d = eps2d
+    assert_same(case, backend, tolerance=1e-3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("size", [1e-3, 0.01, 0.3])
+@pytest.mark.parametrize("eps2d", [0.03, 0.3])
+def test_antialiased(backend: str, size: float, eps2d: float):
+    case = random_case(200, 48, 48, size=size)
+    case.eps2d, case.antialiased = eps2d, True
+    assert_same(case, backend, tolerance=5e-4)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_antialiased_needles_and_discs(backend: str):
+    case = random_case(100, 64, 64)
+    case.antialiased = True
+    case.scales[:, 0] = 2.0
+    case.scales[:50, 1:] = 1e-3
+    case.scales[50:, 1] = 2.0
+    case.scales[50:, 2] = 1e-5
     assert_same(case, backend, tolerance=1e-3)
 
 

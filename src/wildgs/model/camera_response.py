@@ -15,18 +15,25 @@ A response is a vector of 8 numbers, all zero for the identity:
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.config import CameraResponseConfig
+from wildgs.model.response_kernels import respond
+from wildgs.threads import launch
 
 GAIN_TERMS, CURVE_TERMS = 2, 2
 RESPONSE_SIZE = GAIN_TERMS + 3 * CURVE_TERMS
 """Numbers of a response."""
-ROUNDS, TRAINING_ROUNDS = 5, 3
+ROUNDS, TRAINING_ROUNDS = 5, 2
 """Iterations of Gauss-Newton and of the robust weights."""
+TRAINING_PIXELS = 1024
+"""Number of pixels that a fit in training reads at most, approximately."""
 RIDGE = 1e-4
 """Ridge regularisation towards the identity, in units of mean squared colour."""
 OUTLIER = 0.1
@@ -37,19 +44,24 @@ MOST_GAIN, MOST_CURVE = 0.6, 0.9
 """Limits of ``|a1| + |a2|`` and of ``|b1| + |b2|``, for a positive gain and a monotone curve."""
 
 
-def squared_radius(
-    camera: Camera, pixels: tuple[Int[Tensor, "*pixels"], Int[Tensor, "*pixels"]] | None = None
-) -> Float[Tensor, "*pixels"]:
+def squared_radius(camera: Camera, every: int = 1) -> Float[Tensor, "h w"]:
     """r^2 of pixel centres: 0 at the principal point, 1 at the upper left corner of the image.
 
     A crop that keeps this corner, such as the left half of a photo, has the same values as the photo.
 
     Args:
         camera: The camera.
-        pixels: Rows and columns of the pixels; None for the whole image.
+        every: Distance of the rows and columns that are wanted.
     """
-    rays = camera.pixel_rays(pixels)[..., :2] * camera.K.diagonal()[:2]
-    return rays.square().sum(dim=-1) / camera.K[:2, 2].square().sum().clamp_min(1)
+    center = camera.K[:2, 2]
+    x, y = (torch.arange(0, size, every).to(center) + 0.5 for size in (camera.width, camera.height))
+    squares = (y - center[1]).square()[:, None] + (x - center[0]).square()
+    return squares / center.square().sum().clamp_min(1)
+
+
+def sample_distance(height: int, width: int) -> int:
+    """Distance of the rows and columns of a picture that a fit in training reads."""
+    return max(math.ceil(math.sqrt(height * width / TRAINING_PIXELS)), 1)
 
 
 def responded(
@@ -57,20 +69,58 @@ def responded(
 ) -> Float[Tensor, "*pixels 3"]:
     """Applies a response to rendered colours; outside [0, 1], the curve is the identity.
 
+    Gradients reach the colours, not the response.
+
     Args:
         colors: Rendered colours.
         radius: From `squared_radius`.
         response: From `fit_response`.
     """
-    gain, curve = response[:GAIN_TERMS], response[GAIN_TERMS:].reshape(3, CURVE_TERMS)
-    exposed = colors * (1 + _powers(radius) @ gain)[..., None]
+    applied: Tensor = _Responded.apply(colors, radius, response)
+    return applied
+
+
+class _Responded(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, colors: Tensor, radius: Tensor, response: Tensor) -> Tensor:
+        ctx.save_for_backward(colors, radius, response)
+        if colors.device.type == "cpu":
+            return _on_cpu(colors, radius, response, None)
+        exposed = colors * _gain(radius, response[:GAIN_TERMS])[..., None]
+        return _curved(exposed, *response[GAIN_TERMS:].reshape(3, CURVE_TERMS).T)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        colors, radius, response = ctx.saved_tensors
+        if colors.device.type == "cpu":
+            return _on_cpu(colors, radius, response, gradients[0]), None, None
+        gain = _gain(radius, response[:GAIN_TERMS])[..., None]
+        slope = _slope(colors * gain, *response[GAIN_TERMS:].reshape(3, CURVE_TERMS).T)
+        return slope * gain * gradients[0], None, None
+
+
+def _on_cpu(colors: Tensor, radius: Tensor, response: Tensor, gradient: Tensor | None) -> Tensor:
+    flat = [x.detach().float().reshape(-1).numpy() for x in (colors, radius, response)]
+    out = torch.empty(colors.shape)
+    slopes = flat[0] if gradient is None else gradient.reshape(-1).numpy()
+    launch(respond, *flat, slopes, gradient is not None, out.view(-1).numpy())
+    return out
+
+
+def _gain(radius: Float[Tensor, "*pixels"], gain: Float[Tensor, " G"]) -> Float[Tensor, "*pixels"]:
+    return 1 + radius * (gain[0] + gain[1] * radius)
+
+
+def _curved(exposed: Float[Tensor, "*colors"], first: Tensor, second: Tensor) -> Float[Tensor, "*colors"]:
+    """Tone curves; coefficients are broadcast over the colours."""
     x = exposed.clamp(0, 1)
-    # Factored, which needs fewer passes over the pixels than a sum of terms.
-    return exposed + x * (1 - x) * (curve[:, 0] + curve[:, 1] * (1 - 2 * x))
+    return torch.addcmul(exposed, x - x * x, first + second * (1 - 2 * x))
 
 
-def _powers(radius: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels G"]:
-    return torch.stack([radius, radius.square()], dim=-1)
+def _slope(exposed: Float[Tensor, "*colors"], first: Tensor, second: Tensor) -> Float[Tensor, "*colors"]:
+    """Derivative of `_curved` with respect to exposed colours."""
+    x = exposed.clamp(0, 1)
+    return torch.where(x == exposed, 1 + first * (1 - 2 * x) + second * (1 + 6 * (x * x - x)), 1)
 
 
 @torch.no_grad()
@@ -98,42 +148,52 @@ def fit_response(
     Returns:
         The response; zero if too few pixels have a weight.
     """
-    base = weights.reshape(-1).double()
+    base = weights.reshape(-1)
     counts = base > 0
     colors, target = (
-        torch.where(counts[:, None], x.reshape(-1, 3), 0).double() for x in (render.clamp(max=1), photo)
+        torch.where(counts, x.reshape(-1, 3).T, 0).contiguous() for x in (render.clamp(max=1), photo)
     )
-    radius = radius.reshape(-1).double()
-    fitted = torch.tensor([config.vignetting] * GAIN_TERMS + [config.curve] * 3 * CURVE_TERMS).to(colors)
-    ridge = RIDGE * torch.eye(RESPONSE_SIZE).to(colors)
-    response, trusted = colors.new_zeros(RESPONSE_SIZE), torch.where(counts, base, 0)
+    base, radius = torch.where(counts, base, 0), radius.reshape(-1)
+    fitted = torch.tensor([config.vignetting] * GAIN_TERMS + [config.curve] * CURVE_TERMS).to(colors)
+    response, trusted = colors.new_zeros(RESPONSE_SIZE), base
     for _ in range(rounds):
-        residual = target - responded(colors, radius, response)
-        terms = (_derivative(colors, radius, response) * fitted).flatten(0, 1)
-        root = trusted.repeat_interleave(3)[:, None] / (3 * trusted.sum().clamp_min(1e-9))
-        normal = terms.T @ (terms * root) + ridge
-        right = (terms * root).T @ residual.reshape(-1) - RIDGE * response
-        change = torch.linalg.solve_ex(normal, right[:, None]).result[:, 0]
+        curve = response[GAIN_TERMS:].reshape(3, CURVE_TERMS).T[:, :, None]
+        exposed = colors * _gain(radius, response[:GAIN_TERMS])
+        residual = target - _curved(exposed, *curve)
+        terms = _derivative(colors, radius, exposed, curve) * fitted[:, None]
+        weighted = terms * (trusted / (3 * trusted.sum().clamp_min(1e-9)))
+        normal, right = _assembled(weighted @ terms.mT, (weighted @ residual[:, :, None])[..., 0])
+        normal.diagonal().add_(RIDGE)
+        change = torch.linalg.solve_ex(normal, (right - RIDGE * response)[:, None]).result[:, 0]
         response = _limited(response + change)
-        trusted = torch.where(counts, base / (1 + (residual.abs().mean(dim=1) / OUTLIER).square()), 0)
+        trusted = base / (1 + (residual.abs().mean(dim=0) / OUTLIER).square())
     usable = response.isfinite().all() & (counts.sum() >= LEAST_PIXELS)
     return torch.where(usable, response, 0).to(render.dtype)
 
 
 def _derivative(
-    colors: Float[Tensor, "P 3"], radius: Float[Tensor, " P"], response: Float[Tensor, " Q"]
-) -> Float[Tensor, "P 3 Q"]:
-    """Derivative of `responded` with respect to the response."""
-    powers, curve = _powers(radius), response[GAIN_TERMS:].reshape(3, CURVE_TERMS)
-    exposed = colors * (1 + powers @ response[:GAIN_TERMS])[:, None]
+    colors: Float[Tensor, "3 P"],
+    radius: Float[Tensor, " P"],
+    exposed: Float[Tensor, "3 P"],
+    curve: Float[Tensor, "C 3 1"],
+) -> Float[Tensor, "3 T P"]:
+    """Derivatives of each channel with respect to the gain and to the channel's own curve."""
+    by_first = colors * _slope(exposed, *curve) * radius
     x = exposed.clamp(0, 1)
-    inside = (exposed > 0) & (exposed < 1)
-    slope = 1 + inside * (curve[:, 0] * (1 - 2 * x) + curve[:, 1] * (1 - 6 * x + 6 * x * x))
-    by_gain = (colors * slope)[..., None] * powers[:, None]
-    bump = x * (1 - x)
-    by_curve = torch.stack([bump, bump * (1 - 2 * x)], dim=-1)
-    of_channel = torch.eye(3).to(colors)[:, :, None] * by_curve[:, :, None]
-    return torch.cat([by_gain, of_channel.flatten(2)], dim=-1)
+    bump = x - x * x
+    return torch.stack([by_first, by_first * radius, bump, bump * (1 - 2 * x)], dim=1)
+
+
+def _assembled(
+    normal: Float[Tensor, "3 T T"], right: Float[Tensor, "3 T"]
+) -> tuple[Float[Tensor, "Q Q"], Float[Tensor, " Q"]]:
+    """One system for the common gain and the three curves, from one system per channel."""
+    g = GAIN_TERMS
+    curves = torch.block_diag(*normal[:, g:, g:])
+    across = torch.cat(list(normal[:, :g, g:]), dim=1)
+    gain = normal[:, :g, :g].sum(dim=0)
+    system = torch.cat([torch.cat([gain, across], dim=1), torch.cat([across.T, curves], dim=1)])
+    return system, torch.cat([right[:, :g].sum(dim=0), right[:, g:].reshape(-1)])
 
 
 def _limited(response: Float[Tensor, " Q"]) -> Float[Tensor, " Q"]:

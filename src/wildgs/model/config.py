@@ -258,6 +258,8 @@ class WildGSConfig:
             (`wildgs.model.light_basis`); 0 = none. Not in the paper.
         eps2d: Added to the diagonal of projected 2D covariances, in square pixels. 3DGS uses 0.3, which blurs
             pixel-sized detail.
+        antialiased: Compensate for `eps2d` in opacities (gsplat's antialiased mode), so that renders of other sizes
+            than the training photos' keep their sharpness and thin structures. Not in the paper.
         learning_rates: Learning rates of networks and intrinsic features.
     """
 
@@ -276,6 +278,7 @@ class WildGSConfig:
     light_codes: int = 8
     light_components: int = 32
     eps2d: float = 0.1
+    antialiased: bool = False
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
     def __post_init__(self) -> None:

@@ -38,12 +38,13 @@ class Gaussians(nn.Module):
     Attributes:
         rows: All parameters.
         eps2d: Added to the diagonal of 2D covariances; see `wildgs.rasterize.project`.
+        antialiased: Whether opacities compensate for it; see `wildgs.rasterize.project`.
     """
 
     def __init__(self, rows: dict[str, Tensor]) -> None:
         """Creates the parameters from initial values, which include `GEOMETRY_ROWS`."""
         super().__init__()
-        self.eps2d = EPS2D
+        self.eps2d, self.antialiased = EPS2D, False
         self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})
 
     def __len__(self) -> int:
@@ -83,6 +84,7 @@ class Gaussians(nn.Module):
             near=NEAR,
             absgrad=absgrad,
             eps2d=self.eps2d,
+            antialiased=self.antialiased,
         )
 
 

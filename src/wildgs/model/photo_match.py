@@ -19,6 +19,7 @@ from wildgs.model.camera_response import (
     TRAINING_ROUNDS,
     fit_response,
     responded,
+    sample_distance,
     squared_radius,
     static_weights,
 )
@@ -263,14 +264,15 @@ class PhotoMatch(nn.Module):
             rendering: The render of its camera under its appearance.
             training: Whether to read a sample of the pixels, in fewer iterations.
         """
-        part = (slice(None, None, MATCH_EVERY),) * 2 if training else (...,)
+        every = sample_distance(*sight.photo.shape[:2]) if training else 1
+        part = (slice(None, None, every),) * 2
         visibility, keep = (None if x is None else x[part] for x in (sight.visibility, sight.keep))
         static = liftable(visibility, rendering.alpha[part], self.config.mask_threshold)
         return fit_response(
             self.config.camera_response,
             rendering.colors[part],
             sight.photo[part],
-            squared_radius(sight.projection.camera)[part],
+            squared_radius(sight.projection.camera, every),
             static_weights(static, visibility, keep),
             rounds=TRAINING_ROUNDS if training else ROUNDS,
         )

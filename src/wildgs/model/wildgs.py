@@ -62,7 +62,7 @@ class WildGS(Method):
         super().__init__()
         self.config = config
         self.gaussians = gaussians
-        gaussians.eps2d = config.eps2d
+        gaussians.eps2d, gaussians.antialiased = config.eps2d, config.antialiased
         self.sh_degree = config.fusion.sh_degree
         self.global_size = config.parsing.global_size
         self.local_size = config.wrapping.local_size

@@ -54,6 +54,7 @@ def project(
     near: float,
     absgrad: bool,
     eps2d: float,
+    antialiased: bool,
 ) -> Projection:
     """See `wildgs.rasterize.project`."""
     gsplat = load_gsplat()
@@ -63,9 +64,10 @@ def project(
     means, quats, scales, visible_opacities = _finite(means, quats, scales, opacities)
     view, K = (t.to(means)[None] for t in (camera.viewmat, camera.K))
     # Packed mode is not used: in gsplat 1.5.3 it reads Gaussian indices of another integer type than it writes.
-    radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
+    radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
         means, None, quats, scales, view, K, camera.width, camera.height,
         eps2d=eps2d, near_plane=near, packed=False, opacities=visible_opacities,
+        calc_compensations=antialiased,
     )  # fmt: skip
     columns, lines = -(-camera.width // TILE), -(-camera.height // TILE)
     _, intersections, flatten_ids = gsplat.isect_tiles(
@@ -79,6 +81,8 @@ def project(
     means2d = torch.where(seen[:, None], means2d, 0)
     depths = torch.where(seen, depths, 0)
     conics = torch.where(seen[:, None], conics, 0)
+    if antialiased:
+        opacities = torch.where(seen, opacities.clamp(max=1) * compensations.squeeze(0), 0)
     largest = torch.where(seen, reach.amax(-1), 0)
     tiles = _Tiles(offsets, flatten_ids)
     return _projection(camera, means2d, depths, conics, opacities, largest, tiles, absgrad)

@@ -63,10 +63,11 @@ def project(
     near: float = 0.01,
     absgrad: bool = False,
     eps2d: float = EPS2D,
+    antialiased: bool = False,
 ) -> Projection:
     """Projects Gaussians into a camera and sorts them into tiles, for any number of `blend` calls.
 
-    Semantics are those of gsplat 1.5's classic mode (`rasterize_mode="classic"`). A Gaussian is culled (radius 0,
+    Semantics are those of gsplat 1.5 (`rasterize_mode`). A Gaussian is culled (radius 0,
     no gradient) if it lies in front of the near plane, touches no pixel, has an opacity below 1/255, or has a
     non-finite parameter.
 
@@ -80,6 +81,9 @@ def project(
         near: Near plane: depth in world units up to which Gaussians are culled.
         absgrad: Collect absolute screen gradients in `Projection.absgrad` during the backward pass.
         eps2d: Added to the diagonal of the 2D covariances, square pixels.
+        antialiased: Multiply opacities by sqrt(det before / det after adding eps2d), so that the filter does not
+            enlarge small Gaussians (the 2D filter of Mip-Splatting, Yu et al. 2024; gsplat's "antialiased" mode).
+            False is gsplat's "classic" mode.
 
     Raises:
         ValueError: Shapes, devices or dtypes do not match, or the backend is unknown.
@@ -97,7 +101,7 @@ def project(
         _check(name, tensor, shape, means, backend)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"the camera's image has no pixels: {camera.width} x {camera.height}")
-    return module.project(means, quats, scales, opacities, camera, near, absgrad, eps2d)
+    return module.project(means, quats, scales, opacities, camera, near, absgrad, eps2d, antialiased)
 
 
 def blend(
@@ -218,13 +222,17 @@ def rasterize(
     near: float = 0.01,
     depth: bool = True,
     eps2d: float = EPS2D,
+    antialiased: bool = False,
 ) -> Rendering:
     """Renders Gaussians in one call: `project`, `sh_to_colors` if `sh_degree` is given, `blend`.
 
     `colors` are per-Gaussian values, or spherical harmonics if `sh_degree` is given. The other arguments and the
     errors are those of `project` and `blend`.
     """
-    projection = project(means, quats, scales, opacities, camera, backend=backend, near=near, eps2d=eps2d)
+    projection = project(
+        means, quats, scales, opacities, camera,
+        backend=backend, near=near, eps2d=eps2d, antialiased=antialiased,
+    )  # fmt: skip
     if sh_degree is not None:
         colors = sh_to_colors(means, colors, camera, degree=sh_degree, visible=projection.visible)
     return blend(projection, colors, background=background, depth=depth)

@@ -26,7 +26,7 @@ _FIRST, _BEFORE = (1, 5, 3), (1, 6)
 _CALLS = {
     "fully_fused_projection": (
         ("means", "covars", "quats", "scales", "viewmats", "Ks", "width", "height"),
-        ("eps2d", "near_plane", "packed", "opacities"),
+        ("eps2d", "near_plane", "packed", "opacities", "calc_compensations"),
     ),
     "isect_tiles": (
         ("means2d", "radii", "depths", "tile_size", "tile_width", "tile_height"),

@@ -35,7 +35,7 @@ class Projection:
             the screen gradient after the backward pass (densification).
         depths: Camera-space z of the centres, world units. Differentiable.
         conics: Inverse of the dilated 2D covariances (xx, xy, yy), in 1/pixel^2. Differentiable.
-        opacities: As passed to `project`. Differentiable.
+        opacities: As passed to `project`, times the compensation if it is antialiased. Differentiable.
         radii: Radii in pixels, rounded up, at which alpha falls to 1/255 along the wider image axis (the larger of
             gsplat 1.5's opacity-aware radii); 0 for culled Gaussians.
         backend: The backend that made the projection and must blend it.

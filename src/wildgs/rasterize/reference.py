@@ -52,6 +52,7 @@ def project(
     near: float,
     absgrad: bool,
     eps2d: float,
+    antialiased: bool,
 ) -> Projection:
     """See `wildgs.rasterize.project`."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
@@ -66,6 +67,11 @@ def project(
     determinant = a * c - b * b
     centres = points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2]
     conics = torch.stack([c, -b, a], -1) / determinant[:, None]
+    opacities = opacities.clamp(max=1)
+    if antialiased:
+        before = torch.linalg.cross(footprint[:, 0], footprint[:, 1]).square().sum(-1)
+        compensation = (before / determinant).clamp(1e-20, 1).sqrt()
+        opacities = torch.zeros_like(opacities).index_put((chosen,), opacities[chosen] * compensation)
 
     with torch.no_grad():
         extent = (2 * (opacities[chosen] / MIN_ALPHA).log()).clamp(min=0).sqrt()
@@ -73,7 +79,7 @@ def project(
         size = torch.tensor([camera.width, camera.height]).to(half)
         inside = ((centres + half > 0) & (centres - half < size)).all(-1)
         numbers = torch.cat([centres, conics, covariance.flatten(1)], -1)
-        kept = inside & (determinant > 0) & numbers.isfinite().all(-1)
+        kept = inside & (opacities[chosen] >= MIN_ALPHA) & (determinant > 0) & numbers.isfinite().all(-1)
         radii = torch.zeros(len(means), dtype=torch.int32, device=means.device)
         radii[chosen[kept]] = half.amax(-1).ceil().clamp(max=1e9).to(torch.int32)[kept]
     index = chosen[kept]
@@ -82,7 +88,7 @@ def project(
         means2d=means.new_zeros(len(means), 2).index_put((index,), centres[kept]),
         depths=means.new_zeros(len(means)).index_put((index,), points[kept, 2]),
         conics=means.new_zeros(len(means), 3).index_put((index,), conics[kept]),
-        opacities=opacities.clamp(max=1),
+        opacities=opacities,
         radii=radii,
         backend="reference",
         tiles=None,

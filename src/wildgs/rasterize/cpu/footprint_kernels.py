@@ -61,6 +61,12 @@ def clamp_limits(lens, width, height):
 
 
 @njit(nogil=True)
+def cross(u):
+    """Cross product of the two rows of U. Its length is the root of the determinant of U U^T, also for needles."""
+    return (u[1] * u[5] - u[2] * u[4], u[2] * u[3] - u[0] * u[5], u[0] * u[4] - u[1] * u[3])
+
+
+@njit(nogil=True)
 def footprint(i, quats, scales, R, lens, width, height, x, y, z, iz):
     """U = J R R_q S of sixteen Gaussians (2 x 3), whose square is the 2D covariance.
 

@@ -10,10 +10,11 @@ from wildgs.rasterize.cpu.footprint_kernels import (
     GROUP,
     camera_numbers,
     clamp_limits,
+    cross,
     footprint,
     matmul,
 )
-from wildgs.rasterize.cpu.simd import select, splat
+from wildgs.rasterize.cpu.simd import select, splat, vmax, vsqrt
 from wildgs.rasterize.cpu.simd_memory import vload, vload2, vload3, vstore3, vstore4
 from wildgs.threads import fetch_add
 
@@ -21,9 +22,9 @@ from wildgs.threads import fetch_add
 @njit(nogil=True)
 def project_backward(
     counter, means, quats, scales, view, lens, width, height, radii,
-    v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
+    v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats, v_scales,
 ):  # fmt: skip
-    """Gradients of means, quaternions and scales from those of centres, depths and conics."""
+    """Gradients of means, quaternions and scales from those of centres, depths, conics and compensations."""
     n = radii.size
     groups = (n + GROUP - 1) // GROUP
     seen = np.empty(GROUP, np.float32)
@@ -40,7 +41,7 @@ def project_backward(
             if any_seen:
                 project_group_backward(
                     i, seen, means, quats, scales, view, lens, width, height,
-                    v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
+                    v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats, v_scales,
                 )  # fmt: skip
             else:
                 v_means[3 * i : 3 * (i + GROUP)] = 0.0
@@ -51,7 +52,7 @@ def project_backward(
 @njit(nogil=True)
 def project_group_backward(
     i, seen, means, quats, scales, view, lens, width, height,
-    v_means2d, v_depths, v_conics, v_means, v_quats, v_scales,
+    v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats, v_scales,
 ):  # fmt: skip
     """The chain rule through `project_group` for sixteen Gaussians."""
     ok = vload(seen, 0) > 0.0
@@ -73,12 +74,25 @@ def project_group_backward(
     v_mx, v_my = vload2(v_means2d, 2 * i)
     ga, gb, gc = ga * scale, gb * scale, gc * scale
     v_det = (gb * b - ga * c - gc * a) * scale
+    if lens[5] > 0.0:
+        # compensation = |n| / sqrt(a c - b b), where n is the cross product of the rows of U.
+        n0, n1, n2 = cross(u)
+        length = vsqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        v_length = vload(v_compensations, i) * vsqrt(scale)
+        v_det = v_det - 0.5 * v_length * length * scale
     v_a, v_b, v_c = gc + v_det * c, -gb - 2.0 * v_det * b, ga + v_det * a
 
     g = (
         2.0 * v_a * u[0] + v_b * u[3], 2.0 * v_a * u[1] + v_b * u[4], 2.0 * v_a * u[2] + v_b * u[5],
         2.0 * v_c * u[3] + v_b * u[0], 2.0 * v_c * u[4] + v_b * u[1], 2.0 * v_c * u[5] + v_b * u[2],
     )  # fmt: skip
+    if lens[5] > 0.0:
+        per_length = v_length / vmax(length, 1e-12)
+        n0, n1, n2 = n0 * per_length, n1 * per_length, n2 * per_length
+        g = (
+            g[0] + u[4] * n2 - u[5] * n1, g[1] + u[5] * n0 - u[3] * n2, g[2] + u[3] * n1 - u[4] * n0,
+            g[3] + n1 * u[2] - n2 * u[1], g[4] + n2 * u[0] - n0 * u[2], g[5] + n0 * u[1] - n1 * u[0],
+        )  # fmt: skip
     s0, s1, s2 = vload3(scales, 3 * i)
     jx, jy = lens[0] * iz, lens[1] * iz
     k0, k1, k2 = jx * g[0], jx * g[1], jx * g[2]

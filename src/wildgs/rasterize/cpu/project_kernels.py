@@ -14,6 +14,7 @@ from wildgs.rasterize.cpu.footprint_kernels import (
     LOG2_E,
     MIN_ALPHA,
     camera_numbers,
+    cross,
     footprint,
 )
 from wildgs.rasterize.cpu.reach_kernels import (
@@ -33,9 +34,11 @@ from wildgs.threads import fetch_add
 @njit(nogil=True)
 def project_forward(
     counter, means, quats, scales, opacities, view, lens, width, height, near,
-    means2d, depths, conics, radii, records, boxes, masks, tile_counts,
+    means2d, depths, conics, compensations, radii, records, boxes, masks, tile_counts,
 ):  # fmt: skip
     """Projects all Gaussians: centres, depths, conics, radii, blending records and the tiles that they reach.
+
+    If `lens` says antialiased, `compensations` takes what opacities are multiplied with; else it may be empty.
 
     A Gaussian's tiles lie in its box (first and last tile, inclusive; packed by `pack_box`); where the box is at
     most 4 x 4 tiles, its mask has a bit per tile that is reached, else it is -1.
@@ -51,7 +54,7 @@ def project_forward(
             i = min(group * GROUP, n - GROUP)
             large = project_group(
                 i, means, quats, scales, opacities, view, lens, width, height, near,
-                means2d, depths, conics, records, spans,
+                means2d, depths, conics, compensations, records, spans,
             )  # fmt: skip
             for lane in range(GROUP):
                 g = i + lane
@@ -95,7 +98,8 @@ def find_tiles(g, x0, y0, x1, y1, records):
 
 @njit(nogil=True)
 def project_group(
-    i, means, quats, scales, opacities, view, lens, width, height, near, means2d, depths, conics, records, spans
+    i, means, quats, scales, opacities, view, lens, width, height, near,
+    means2d, depths, conics, compensations, records, spans,
 ):  # fmt: skip
     """Sixteen Gaussians from index i.
 
@@ -116,6 +120,11 @@ def project_group(
     c = u[3] * u[3] + u[4] * u[4] + u[5] * u[5] + lens[4]
     determinant = a * c - b * b
     opacity = vload(opacities, i)
+    if lens[5] > 0.0:
+        n0, n1, n2 = cross(u)
+        kept = (n0 * n0 + n1 * n1 + n2 * n2) / select(determinant > 0.0, determinant, 1.0)
+        compensation = vsqrt(vmin(kept, 1.0))
+        opacity = select(opacity < 1e6, vmin(opacity, 1.0), opacity) * compensation
     mx, my = lens[0] * x * iz + lens[2], lens[1] * y * iz + lens[3]
 
     # NaN fails every comparison, and infinity the upper bounds: what is not finite is culled here.
@@ -130,6 +139,8 @@ def project_group(
     scale = 1.0 / select(sound, determinant, 1.0)
     conic_a, conic_b, conic_c = c * scale, -b * scale, a * scale
     vstore(depths, i, select(seen, z, zero))
+    if lens[5] > 0.0:
+        vstore(compensations, i, select(seen, compensation, zero))
     vstore2(means2d, 2 * i, (select(seen, mx, zero), select(seen, my, zero)))
     vstore3(
         conics, 3 * i, (select(seen, conic_a, zero), select(seen, conic_b, zero), select(seen, conic_c, zero))

@@ -87,7 +87,7 @@ class TileLists:
 
 @dataclass(frozen=True)
 class _Lens:
-    """Camera parameters in the layout of the kernels: `lens` is fx, fy, cx, cy, eps2d."""
+    """Camera parameters in the layout of the kernels: `lens` is fx, fy, cx, cy, eps2d, antialiased."""
 
     view: np.ndarray
     lens: np.ndarray
@@ -95,10 +95,10 @@ class _Lens:
     height: int
 
     @staticmethod
-    def of(camera: Camera, eps2d: float) -> _Lens:
+    def of(camera: Camera, eps2d: float, antialiased: bool) -> _Lens:
         K = camera.K.detach().to("cpu", torch.float32)
         view = camera.viewmat.detach().to("cpu", torch.float32)[:3].contiguous().numpy().reshape(-1)
-        lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], eps2d], np.float32)
+        lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], eps2d, antialiased], np.float32)
         return _Lens(view, lens, camera.width, camera.height)
 
     def arguments(self) -> tuple[Any, ...]:
@@ -121,21 +121,20 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, lens: _Lens, outputs: Any) -> Any:
-        means2d, depths, conics, radii = outputs
+        *values, radii = outputs
         ctx.save_for_backward(means, quats, scales, radii)
         ctx.lens = lens
-        return means2d, depths, conics
+        return tuple(values)
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        v_means2d, v_depths, v_conics = grads
         means, quats, scales, radii = ctx.saved_tensors
         outputs = (torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales))
         launch(
             project_backward_kernels.project_backward,
             *map(flat, (means, quats, scales)),
             *ctx.lens.arguments(),
-            *map(flat, (radii, v_means2d, v_depths, v_conics)),
+            *map(flat, (radii, *grads)),
             *map(flat, outputs),
             items=_chunks(len(means)),
         )
@@ -155,14 +154,16 @@ def project(
     near: float,
     absgrad: bool,
     eps2d: float,
+    antialiased: bool,
 ) -> Projection:
     """See `wildgs.rasterize.project`."""
     n = len(means)
     means_, quats_, scales_, opacities_ = (_padded(t).contiguous() for t in (means, quats, scales, opacities))
-    lens = _Lens.of(camera, eps2d)
+    lens = _Lens.of(camera, eps2d, antialiased)
     count = len(means_)
     means2d, depths = torch.empty(count, 2), torch.empty(count)
     conics, radii = torch.empty(count, 3), torch.empty(count, dtype=torch.int32)
+    compensations = torch.empty(count if antialiased else 0)
     tile_counts = np.empty(count, np.int32)
     with (
         scratch("records", count * RECORD, np.float32) as records,
@@ -174,20 +175,20 @@ def project(
             *map(flat, (means_, quats_, scales_, opacities_)),
             *lens.arguments(),
             np.float32(near),
-            *map(flat, (means2d, depths, conics, radii)),
+            *map(flat, (means2d, depths, conics, compensations, radii)),
             records, boxes, masks, tile_counts,
             items=_chunks(count),
         )  # fmt: skip
         tiles = _list_tiles(depths.numpy(), records, boxes, masks, tile_counts, camera)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means_, quats_, scales_)):
-        outputs = (means2d, depths, conics, radii)
-        means2d, depths, conics = _Project.apply(means_, quats_, scales_, lens, outputs)  # type: ignore[misc]
+        outputs = (means2d, depths, conics, compensations, radii)
+        means2d, depths, conics, compensations = _Project.apply(means_, quats_, scales_, lens, outputs)  # type: ignore[misc]
     return Projection(
         camera=camera,
         means2d=_first(means2d, n),
         depths=_first(depths, n),
         conics=_first(conics, n),
-        opacities=opacities,
+        opacities=opacities.clamp(max=1) * _first(compensations, n) if antialiased else opacities,
         radii=_first(radii, n),
         backend="cpu",
         tiles=tiles,

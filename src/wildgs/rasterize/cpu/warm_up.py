@@ -31,11 +31,12 @@ def compile_gradients() -> None:
     colors = _Shade.apply(_empty(0, 3), _empty(0, 1, 3), np.zeros(3, np.float32), 0, np.empty(0, bool), 0.0)
     assert isinstance(colors, Tensor)
     colors.sum().backward()
-    lens = _Lens(np.zeros(12, np.float32), np.ones(5, np.float32), 1, 1)
+    lens = _Lens(np.zeros(12, np.float32), np.zeros(6, np.float32), 1, 1)
     outputs = (
         torch.zeros(GROUP, 2),
         torch.zeros(GROUP),
         torch.zeros(GROUP, 3),
+        torch.zeros(0),
         torch.zeros(GROUP, dtype=torch.int32),
     )
     projected = _Project.apply(_empty(GROUP, 3), _empty(GROUP, 4), _empty(GROUP, 3), lens, outputs)
