@@ -44,6 +44,7 @@ MENDED = {
     "train.schedule.encoder_every": 1,
     "train.schedule.reset_every": 3000,
     "train.schedule.mask_every": 1,
+    "train.schedule.mask_visits": 0,
     "train.schedule.planes_every": 1,
     "train.optimizer.short_runs": 0.0,
     "train.density.strategy": "classic",

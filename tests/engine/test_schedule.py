@@ -33,7 +33,8 @@ def test_densification_can_be_switched_off() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["densify_every", "reset_every", "first_stage", "sh_every", "encoder_every", "mask_every"]
+    "name",
+    ["densify_every", "reset_every", "first_stage", "sh_every", "encoder_every", "mask_every", "mask_visits"],
 )
 def test_impossible_steps_are_one_line(name: str) -> None:
     with pytest.raises(UserError, match=rf"schedule\.{name} -1: must be"):
@@ -41,6 +42,32 @@ def test_impossible_steps_are_one_line(name: str) -> None:
     if name in ("sh_every", "encoder_every", "mask_every"):
         with pytest.raises(UserError, match="must be 1 or more"):
             ScheduleConfig(**{name: 0})
+
+
+def test_masks_become_final_once_every_photo_was_seen_often() -> None:
+    schedule = Schedule(ScheduleConfig(), 30_000, reset_every=0, photos=200)
+    learnt = [step for step in range(30_000) if schedule.stage(step, 1).learn_mask]
+    assert learnt[:1000] == list(range(1000))
+    assert learnt[-1] in (3998, 3999)
+    assert schedule.mask_progress(2000) == pytest.approx(0.5, abs=0.001)
+    assert schedule.mask_progress(29_999) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("config", "steps", "photos", "expected"),
+    [
+        (ScheduleConfig(), 30_000, 10, 1500),  # a mask needs that many steps, however few photos there are
+        (ScheduleConfig(), 1500, 90, 1500),
+        (ScheduleConfig(), 30_000, 5000, 30_000),
+        (ScheduleConfig(), 30_000, None, 30_000),  # a trainable encoder
+        (ScheduleConfig(mask_visits=0), 30_000, 90, 30_000),
+        (ScheduleConfig(mask_visits=50), 30_000, 90, 4500),
+    ],
+)
+def test_steps_of_the_masks_training(
+    config: ScheduleConfig, steps: int, photos: int | None, expected: int
+) -> None:
+    assert Schedule(config, steps, photos=photos).mask_steps == expected
 
 
 def test_half_length_halves() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from wildgs.engine import schedule
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
 from wildgs.engine.config import DensityConfig, Strategy
 from wildgs.engine.density import SeenView
@@ -19,6 +20,7 @@ from wildgs.engine.recorder import Recorder
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.model.config import SQUEEZENET
 from wildgs.model.registry import MethodName, create_method, restore_method
 from wildgs.model.vanilla import VanillaConfig
 from wildgs.model.wildgs import WildGSConfig
@@ -98,6 +100,27 @@ def test_first_stage_has_neither_triplane_nor_depth_loss(wall_scene: Scene, tiny
     assert any(value != 0 for value in depth[15:])
     assert untouched[14]
     assert not untouched[-1]
+
+
+@pytest.mark.parametrize("trainable", [False, True])
+def test_final_masks_still_hide_but_no_longer_change(
+    wall_scene: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch, trainable: bool
+) -> None:
+    """Where the encoder goes on learning, so do the masks, since they depend on it."""
+    monkeypatch.setattr(schedule, "LEAST_MASK_STEPS", 4)
+    encoder = "None" if trainable else SQUEEZENET
+    model = replace(tiny_model, parsing=replace(tiny_model.parsing, encoder=encoder))
+    trainer = trainer_for(wall_scene, model, 12, schedule=ScheduleConfig(mask_visits=1))
+    photo = wall_scene.train_views[0].read_photo().float() / 255
+    masks = {}
+
+    def look(report: StepReport) -> None:
+        masks[report.step] = trainer.method.visibility(photo)
+
+    trainer.run([look])
+    first = max(4, len(wall_scene.train_views))
+    assert not torch.equal(masks[1], masks[first])
+    assert torch.equal(masks[first], masks[12]) != trainable
 
 
 def test_without_depth_there_is_no_depth_loss(wall_scene: Scene, tiny_model: WildGSConfig) -> None:

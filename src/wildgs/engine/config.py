@@ -27,7 +27,10 @@ class ScheduleConfig:
         sh_every: Steps between increases of the active SH degree (3DGS: 1,000).
         encoder_every: Train the image encoder every n-th step (not scaled; paper: 1).
         mask_every: Train the visibility mask every n-th step (not scaled; paper: 1), after the first 30% of the
-            run, where it learns on every step.
+            steps in which it is trained, where it learns on every step.
+        mask_visits: Average number of times that every photo is seen until masks are final (not scaled; at least
+            1,500 steps; 0 = masks are trained in the whole run, as in the paper). In longer training, Gaussians
+            slowly learn passers-by, whose masks would then vanish. Masks of a trainable encoder are never final.
         planes_every: Train the triplane's UNet every n-th step (not scaled; paper: 1).
     """
 
@@ -40,6 +43,7 @@ class ScheduleConfig:
     sh_every: int = 1000
     encoder_every: int = 2
     mask_every: int = 2
+    mask_visits: int = 20
     planes_every: int = 2
 
     def __post_init__(self) -> None:

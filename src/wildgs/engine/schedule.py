@@ -21,15 +21,23 @@ _FLOOR_SHARE = 5
 """Such a smallest step count is at most this part (one fifth) of a run."""
 
 MASK_START = 0.3
-"""Fraction of a run in which the mask learns on every step, before `mask_every` takes effect. Otherwise the
+"""Fraction of the mask's training in which it learns on every step, before `mask_every` takes effect. Otherwise the
 Gaussians learn passers-by before the mask does."""
+
+LEAST_MASK_STEPS = 1500
+"""Smallest number of steps before masks are final."""
 
 
 class Schedule:
     """The schedule of one run."""
 
     def __init__(
-        self, config: ScheduleConfig, steps: int, reset_every: int = 3000, until: float = 0.5
+        self,
+        config: ScheduleConfig,
+        steps: int,
+        reset_every: int = 3000,
+        until: float = 0.5,
+        photos: int | None = None,
     ) -> None:
         """Scales a configuration to the length of a run.
 
@@ -38,11 +46,16 @@ class Schedule:
             steps: Number of steps of the run.
             reset_every: Steps between opacity resets unless configured; the method's default.
             until: Fraction of the run in which Gaussians are densified unless configured; the strategy's default.
+            photos: Number of training photos, if their masks may become final.
         """
         self.steps = steps
         self.encoder_every = config.encoder_every
         self.mask_every = config.mask_every
         self.planes_every = config.planes_every
+        final = photos is not None and config.mask_visits > 0
+        self.mask_steps = (
+            min(steps, max(LEAST_MASK_STEPS, config.mask_visits * (photos or 0))) if final else steps
+        )
         self._factor = steps / REFERENCE_STEPS
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
@@ -67,17 +80,26 @@ class Schedule:
         """Fraction of the run that is done, 0 to 1."""
         return min(step / max(self.steps - 1, 1), 1.0)
 
+    def mask_progress(self, step: int) -> float:
+        """Fraction of the mask's training that is done, 0 to 1."""
+        return min(step / max(self.mask_steps - 1, 1), 1.0)
+
     def stage(self, step: int, sh_degree: int, taken: int = 1) -> Stage:
         """The stage at a step (from 0) that counts as `taken` steps; `sh_degree` is the method's full degree."""
         return Stage(
             explicit=step >= self.first_stage,
-            learn_mask=not self.mask_paused(step)
-            and (step < MASK_START * self.steps or falls_on(step + taken - 1, taken, self.mask_every)),
+            learn_mask=self.learns_mask(step, taken),
             sh_degree=min(step // self.sh_every, sh_degree),
             learn_encoder=falls_on(step + taken - 1, taken, self.encoder_every),
             # Not on the mask's steps, so that all steps take the same time.
             learn_planes=falls_on(step + taken, taken, self.planes_every),
         )
+
+    def learns_mask(self, step: int, taken: int = 1) -> bool:
+        """Whether the mask is trained at a step that counts as `taken` steps."""
+        if step >= self.mask_steps or self.mask_paused(step):
+            return False
+        return step < MASK_START * self.mask_steps or falls_on(step + taken - 1, taken, self.mask_every)
 
     def mask_paused(self, step: int) -> bool:
         """Whether the last opacity reset is less than `mask_pause` steps ago."""

@@ -123,7 +123,8 @@ class Trainer:
         self.seconds = 0.0
         strategy = STRATEGIES[config.density.strategy or method.density]
         resets = method.reset_every if strategy.resets else 0
-        self.schedule = Schedule(config.schedule, config.steps, resets, strategy.until)
+        photos = len(self.views) if method.masks_become_final else None
+        self.schedule = Schedule(config.schedule, config.steps, resets, strategy.until, photos)
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size, config.steps)
@@ -288,7 +289,7 @@ class Trainer:
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
             self.config.objective,
-            self.schedule.progress(self.step),
+            self.schedule.mask_progress(self.step),
             photo,
             output.picture,
             visibility=output.visibility,

@@ -13,7 +13,7 @@ class ObjectiveConfig:
     Attributes:
         weight_l1: λ^I, weight of L1 in the image loss; D-SSIM has 1 - λ^I.
         mask_weight_start: λ^M at the first step.
-        mask_weight_end: λ^M at the last step; linear in between.
+        mask_weight_end: λ^M at the last step in which the mask is trained; linear in between.
         mask_weight_photos: Number of training photos from which on λ^M starts at `mask_weight_start`. With fewer
             photos it starts lower (at `mask_weight_end` with two thirds as many), because a few photos are
             memorised, including passers-by, before the mask has found them. 0 disables this. Not in the
@@ -45,7 +45,7 @@ class ObjectiveConfig:
         """λ^M at one step.
 
         Args:
-            progress: Fraction of the training, 0 at its start and 1 at its end (clamped).
+            progress: Fraction of the mask's training, 0 at its start and 1 at its end (clamped).
             num_photos: Number of training photos; None for enough of them.
         """
         start = self.mask_weight_start

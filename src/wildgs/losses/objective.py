@@ -70,7 +70,7 @@ def total_loss(
 
     Args:
         config: Weights.
-        progress: Fraction of the training done, 0 to 1, for λ^M.
+        progress: Fraction of the mask's training done, 0 to 1, for λ^M.
         photo: I, RGB in [0, 1].
         render: Î.
         visibility: Predicted mask M; None for a method without a mask.

@@ -70,6 +70,7 @@ class WildGS(Method):
         self.depth_supervised = not self._lacks("depth")
         self.sky_depth = SKY_SHARE * config.sky.radius if config.sky.points else 0.0
         self.parsing = Parsing(config.parsing, encoder)
+        self.masks_become_final = self.parsing.encoder.frozen
         self.wrapping = Wrapping(config.wrapping, box, reverse=not self._lacks("reverse"))
         self.fusion = Fusion(config.fusion, config.parsing.global_size, config.wrapping.local_size)
         if config.sky.points and config.sky.own_fusion:
