@@ -4,8 +4,8 @@
 
 Each held-out photo (its clean picture in truth/clean, if the scene has one) is resized to the training size times
 each factor, and compared with a render of that size under the photo's own appearance, which the run encodes at the
-training size. A low-pass filter that enlarges small Gaussians shows as too little detail (below 1) in small renders,
-Gaussians without a filter as too much.
+training size. A low-pass filter that enlarges small Gaussians shows as too little detail (below 1) in small
+renders, Gaussians without a filter as too much.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from wildgs.model.appearance import Appearance, Embeddings, blend_embeddings
+from wildgs.model.encoder import load_encoder
 from wildgs.model.registry import restore_method
 from wildgs.model.training_pass import Stage
 from wildgs.model.vanilla import VanillaConfig, VanillaGS
@@ -262,3 +263,21 @@ def test_parts_are_lifted_in_training_alone(share: float, changes: bool, camera,
         output = model.training_pass(photo, camera, Stage())
         pictures.append(output.rendering.colors.detach())
     assert (not torch.equal(pictures[0], pictures[1]) or not torch.equal(pictures[1], pictures[2])) == changes
+
+
+def test_antialiased_takes_opacity_from_small_gaussians_only(camera, wall, make_wall_model) -> None:
+    config, colors = make_wall_model().config, torch.full((len(wall), 3), 128, dtype=torch.uint8)
+    small = torch.arange(len(wall)) % 2 == 0
+    opacities = {}
+    for antialiased in (False, True):
+        chosen = replace(config, antialiased=antialiased, eps2d=0.3)
+        model = WildGS.from_points(chosen, wall, colors, encoder=load_encoder(None))
+        with torch.no_grad():
+            model.gaussians.rows["opacity_logits"].fill_(6.0)
+            model.gaussians.rows["log_scales"][small] = -5.0  # a seventh of a pixel
+            model.gaussians.rows["log_scales"][~small] = -1.0
+            projection = model.gaussians.project(camera)
+        opacities[antialiased] = torch.where(projection.visible, projection.opacities, torch.nan)
+    ratio = opacities[True] / opacities[False]
+    assert 0 < ratio[small].nanmean() < 0.15
+    assert 0.99 < ratio[~small].nanmean() <= 1

@@ -135,3 +135,20 @@ def test_several_threads_render_at_once():
         job.join()
     assert len(results) == 4
     assert all(torch.equal(picture, expected.colors) for picture in results)
+
+
+@settings(max_examples=25, deadline=None)
+@given(size=st.floats(0.3, 3.0), eps2d=st.floats(0.2, 0.5), along=st.floats(1.0, 3.0))
+def test_antialiased_gaussians_cover_as_much_as_without_the_filter(size: float, eps2d: float, along: float):
+    """The sum of alpha over the pixels is that of the unfiltered footprint, where the classic mode enlarges it."""
+    camera = Camera(torch.eye(4), torch.tensor([[32.0, 0, 32], [0, 32.0, 32], [0, 0, 1]]), 64, 64)
+    inputs = [torch.tensor([[0.02, 0.01, 1.0]]), torch.tensor([[1.0, 0, 0, 0]])]
+    inputs += [torch.tensor([[size * along, size, size]]) / 32, torch.tensor([0.9]), torch.ones(1, 3)]
+    expected = 0.9 * 2 * torch.pi * size * size * along
+    covered = {
+        antialiased: float(rasterize(*inputs, camera, eps2d=eps2d, antialiased=antialiased).alpha.sum())
+        for antialiased in (False, True)
+    }
+    # Alpha below 1/255 is cut off: of a peak of 0.2, 2%.
+    assert covered[True] == pytest.approx(expected, rel=0.1)
+    assert covered[False] > covered[True]
