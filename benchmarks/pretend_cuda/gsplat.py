@@ -69,18 +69,29 @@ class StandIn:
         width: int, height: int, *, eps2d: float, near_plane: float, packed: bool, opacities: Tensor,
         calc_compensations: bool,
     ) -> Any:  # fmt: skip
-        """Radii, centres, depths and conics; opacities are not compensated."""
-        assert not calc_compensations
+        """Radii, centres, depths, conics and compensations."""
         assert isinstance(view, Pretended)
         assert isinstance(K, Pretended)
         camera = Camera(view.inner[0].clone(), K.inner[0].clone(), width, height)
 
         def compute(*geometry: Tensor) -> tuple[Tensor, ...]:
-            seen = self.projection = project(*geometry, camera, backend="cpu", near=near_plane, eps2d=eps2d)
+            seen = self.projection = project(
+                *geometry,
+                camera,
+                backend="cpu",
+                near=near_plane,
+                eps2d=eps2d,
+                antialiased=calc_compensations,
+            )
             radii = seen.radii.int()[None, :, None].expand(-1, -1, 2)
-            return radii, seen.means2d[None], seen.depths[None], seen.conics[None]
+            values = radii, seen.means2d[None], seen.depths[None], seen.conics[None]
+            if not calc_compensations:
+                return values
+            compensations = torch.where(seen.visible, seen.opacities / geometry[3].clamp(1e-6, 1), 0)
+            return *values, compensations[None]
 
-        return (*_Kernel.apply("project", compute, means, quats, scales, opacities), None)
+        found = _Kernel.apply("project", compute, means, quats, scales, opacities)
+        return found if calc_compensations else (*found, None)
 
     def isect_tiles(self, *_: Any, **__: Any) -> Any:
         """Tile lists are in the projection already; gsplat's host waits for their length here."""

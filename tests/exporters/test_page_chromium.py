@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +79,10 @@ def _picture(url: str) -> torch.Tensor:
     return torch.from_numpy(np.array(image)).float() / 255
 
 
-def _expected(splats: Splats, sh: torch.Tensor) -> torch.Tensor:
+def _expected(splats: Splats, sh: torch.Tensor, **filter: Any) -> torch.Tensor:
     rendering = rasterize(
         splats.means, splats.quats, splats.scales, splats.opacities, sh.contiguous(), _camera(),
-        sh_degree=3, near=NEAR, backend="reference",
+        sh_degree=3, near=NEAR, backend="reference", **filter,
     )  # fmt: skip
     return rendering.colors.clamp(0, 1)
 
@@ -104,6 +105,31 @@ def test_pixels_are_those_of_the_renderer(opened: dict[str, Any], value: float) 
     assert _psnr(shown, _expected(opened["splats"], blended)) > 32
     other = lights[0] if value >= 0.5 else lights[1]
     assert _psnr(shown, _expected(opened["splats"], other)) < 20
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_filter_is_that_of_the_run(chromium, splats: Splats, tmp_path: Path, antialiased: bool) -> None:
+    """Gaussians of about a third of a pixel, to which the filter makes most of the difference."""
+    splats, lights = _scene(splats)
+    splats = replace(splats, scales=splats.scales / 8)
+    thumbnail, camera = np.zeros((20, 30, 3), np.uint8), _camera()
+    filter = {"eps2d": 0.1, "antialiased": antialiased}
+    page = Page(
+        "Small", "", splats, [PageLight("one", lights[0], thumbnail)], PageView(camera, 7.0), NEAR, **filter
+    )
+    write_page(page, tmp_path / "page.html")
+    tab = chromium.new_page(viewport={"width": 420, "height": 300})
+    tab.goto((tmp_path / "page.html").as_uri())
+    tab.wait_for_function("document.documentElement.dataset.state", timeout=PATIENCE)
+    tab.evaluate(
+        LOOK, {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": 112, "height": 76}
+    )
+    shown = _picture(tab.evaluate(SNAPSHOT))
+    tab.close()
+    same = _psnr(shown, _expected(splats, lights[0], **filter))
+    other = _psnr(shown, _expected(splats, lights[0], eps2d=0.1, antialiased=not antialiased))
+    assert same > other + 6, (same, other)
+    assert same > 32
 
 
 def test_the_slider_and_the_thumbnails_change_the_light(opened: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ class Page {
   constructor(header, scene) {
     this.header = header;
     this.canvas = element("view");
-    this.stage = new Stage(this.canvas, new RelightableSplats(scene), header.near);
+    this.stage = new Stage(this.canvas, new RelightableSplats(scene), header.near, header.filter);
     this.detail = 1; // share of the screen's pixels per axis that is drawn while moving
     this.lastMove = 0;
     this.fixed = null;

@@ -72,7 +72,7 @@ class FloatCanvas {
 
 /** A canvas that draws one scene. */
 export class Stage {
-  constructor(canvas, splats, near) {
+  constructor(canvas, splats, near, filter) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: false });
     this.renderer.setClearColor(0x000000, 1);
     this.camera = new THREE.PerspectiveCamera(50, 1, near, 5000);
@@ -84,8 +84,9 @@ export class Stage {
       onDirty: () => this.invalidate(),
       accumExtSplats: true,
       sortRadial: false,
-      preBlurAmount: 0.3,
-      blurAmount: 0,
+      // What training added to the footprints, in square pixels; Spark's blurAmount compensates for it in opacities.
+      preBlurAmount: filter.antialiased ? 0 : filter.eps2d,
+      blurAmount: filter.antialiased ? filter.eps2d : 0,
       minAlpha: MIN_ALPHA,
       maxStdDev: MAX_STD_DEV,
       maxPixelRadius: 1e5,

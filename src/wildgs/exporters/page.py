@@ -23,6 +23,7 @@ from wildgs.exporters.splats import Splats
 from wildgs.files import printable, written_aside
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import fit_truncation, truncate_sh
+from wildgs.rasterize import EPS2D
 
 BUDGET_BYTES = 25_000_000
 """Size limit of a page; spherical harmonics are truncated to stay below it."""
@@ -62,6 +63,8 @@ class Page:
         lights: Appearances, from left to right.
         start: Initial view.
         near: Near plane, in units of the aligned frame.
+        eps2d: Added to the diagonal of 2D covariances, square pixels of the page.
+        antialiased: Whether opacities compensate for it.
         day: Whether the lights are in the order of a day, which the page can play.
     """
 
@@ -71,6 +74,8 @@ class Page:
     lights: Sequence[PageLight]
     start: PageView
     near: float
+    eps2d: float = EPS2D
+    antialiased: bool = False
     day: bool = False
 
 
@@ -120,6 +125,7 @@ def _compose(page: Page, scene: PackedScene) -> str:
     header = {
         **scene.header,
         "near": page.near,
+        "filter": {"eps2d": page.eps2d, "antialiased": page.antialiased},
         "day": page.day,
         "start": _start(page.start),
         "lights": [

@@ -88,6 +88,8 @@ def write_webpage(
         lights=lights,
         start=PageView(start.camera, depth),
         near=NEAR,
+        eps2d=loaded.gaussians.eps2d,
+        antialiased=loaded.gaussians.antialiased,
         day=in_order_of_day(loaded, [look.name for look in looks]),
     )
     degree = write_page(page, file, viewpoints=viewpoints_of(scene.views), sh_degree=cleanup.sh_degree)
