@@ -84,6 +84,8 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     for name in ("matched_loss", "light_codes", "light_components", "eps2d"):
         assert model.pop(name) > 0
     assert model.pop("local_embeddings") is False
+    assert model.pop("antialiased") is True
+    assert train["schedule"].pop("mask_visits") > 0
     assert model["sky"].pop("densify") is False
     assert model["sky"].pop("own_fusion") is True
     assert train["optimizer"].pop("short_runs") > 0
@@ -96,6 +98,8 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert not config.model.camera_response.fits
     assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
     assert config.model.eps2d == 0.3  # with which its Gaussians were trained
+    assert not config.model.antialiased
+    assert config.train.schedule.mask_visits == 0
     assert config.model.local_embeddings
     assert config.model.sky.densify
     assert not config.model.sky.own_fusion

@@ -34,6 +34,7 @@ MENDED = {
     "model.color_match": False,
     "model.light_codes": 0,
     "model.eps2d": 0.3,
+    "model.antialiased": False,
     "model.light_components": 0,
     "model.matched_loss": 0.0,
     "train.objective.depth_weight": 0.05,

@@ -12,6 +12,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "light_components"): ("color_match", 0),
     ("model", "local_embeddings"): ("wrapping", True),
     ("model", "eps2d"): ("wrapping", 0.3),
+    ("model", "antialiased"): ("wrapping", False),
     ("model", "sky", "densify"): ("lowest", True),
     ("model", "sky", "own_fusion"): ("lowest", False),
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),

@@ -48,6 +48,7 @@ _PAPER: dict[str, Any] = {
     "model.light_components": 0,
     "model.matched_loss": 0.0,
     "model.eps2d": 0.3,
+    "model.antialiased": False,
     "train.objective.depth_weight": 0.05,
     "train.objective.metric_weight": 0.0,
     "train.objective.sky_weight": 0.0,

@@ -278,7 +278,7 @@ class WildGSConfig:
     light_codes: int = 8
     light_components: int = 32
     eps2d: float = 0.1
-    antialiased: bool = False
+    antialiased: bool = True
     learning_rates: WildGSRates = field(default_factory=WildGSRates)
 
     def __post_init__(self) -> None:
