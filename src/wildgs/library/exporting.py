@@ -93,10 +93,10 @@ def export(
     chosen = bool(appearance) or (mixing or MixOptions()) != MixOptions()
     looks = find_looks(scene, appearance or (NEUTRAL,), mixing, progress=progress) if kinds or chosen else []
     files = _files(request, looks, kinds, alone=len(kinds) == len(formats))
-    if scene.gaussians.antialiased:
+    if scene.gaussians.antialiased and any(kind != "html" for kind in formats):
         logger.info(
-            "the run was trained with --antialiased, which files cannot say: programs that render without "
-            "antialiasing show its small Gaussians too solid"
+            "the run is antialiased, which these files cannot say: programs that render without antialiasing show "
+            "small Gaussians too solid from afar (docs/export.md)"
         )
     several = [kind for kind in formats if kind in ("html", "glb", "usd")]
     shown = looks if chosen or not several else page_looks(scene, progress)
