@@ -67,6 +67,29 @@ def test_the_response_that_made_a_photo_is_found_in_spite_of_passers_by(seed: in
     )
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), width=st.integers(1, 90), height=st.integers(1, 60))
+def test_values_and_gradient_are_those_of_the_formula(seed: int, width: int, height: int) -> None:
+    """Against automatic differentiation in double precision, also beyond [0, 1] and at sizes of any remainder."""
+    generator, camera = torch.Generator().manual_seed(seed), wide_camera(width, height)
+    radius, response = squared_radius(camera), 0.5 * (torch.rand(RESPONSE_SIZE, generator=generator) - 0.5)
+    colors = (3 * colors_of(camera, seed) - 1).requires_grad_()
+    pull = torch.rand(height, width, 3, generator=generator)
+    shown = responded(colors, radius, response)
+    (shown * pull).sum().backward()
+
+    precise = colors.detach().double().requires_grad_()
+    r, gain, curve = radius.double()[..., None], response[:2].double(), response[2:].double().reshape(3, 2)
+    exposed = precise * (1 + gain[0] * r + gain[1] * r**2)
+    x = exposed.clamp(0, 1)
+    expected = exposed + curve[:, 0] * x * (1 - x) + curve[:, 1] * x * (1 - x) * (1 - 2 * x)
+    (expected * pull).sum().backward()
+    torch.testing.assert_close(shown.double(), expected, atol=1e-5, rtol=1e-5)
+    assert colors.grad is not None
+    assert precise.grad is not None
+    torch.testing.assert_close(colors.grad.double(), precise.grad, atol=1e-5, rtol=1e-4)
+
+
 def test_what_is_off_is_not_fitted() -> None:
     camera = wide_camera()
     render, radius = colors_of(camera), squared_radius(camera)

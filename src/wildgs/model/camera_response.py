@@ -102,9 +102,9 @@ class _Responded(torch.autograd.Function):
 def _on_cpu(colors: Tensor, radius: Tensor, response: Tensor, gradient: Tensor | None) -> Tensor:
     flat = [x.detach().float().reshape(-1).numpy() for x in (colors, radius, response)]
     out = torch.empty(colors.shape)
-    slopes = flat[0] if gradient is None else gradient.reshape(-1).numpy()
+    slopes = flat[0] if gradient is None else gradient.float().reshape(-1).numpy()
     launch(respond, *flat, slopes, gradient is not None, out.view(-1).numpy())
-    return out
+    return out.to(colors.dtype)
 
 
 def _gain(radius: Float[Tensor, "*pixels"], gain: Float[Tensor, " G"]) -> Float[Tensor, "*pixels"]:
