@@ -23,8 +23,12 @@ def test_the_page_holds_the_lights_asked_for(wildgs, trained: Path, tmp_path: Pa
     text = file.read_text(encoding="utf-8")
     header = json.loads(text.split('id="header">')[1].split("</script>")[0])
     assert [light["name"] for light in header["lights"]] == names
+    gaussians = api.load(trained).gaussians
+    assert header["filter"] == {"eps2d": gaussians.eps2d, "antialiased": gaussians.antialiased}
     assert "<title>The gate</title>" in text
-    assert str(file) in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert str(file) in said
+    assert "antialiased" not in said  # the page is
 
 
 def test_without_appearances_the_page_takes_the_lights_of_a_day(
@@ -55,6 +59,14 @@ def test_a_file_is_baked_for_each_appearance_in_the_inputs_frame(
     read = gsply.plyread(tmp_path / "one.ply")
     np.testing.assert_array_equal(read.means, loaded.gaussians.means.detach().numpy())
     np.testing.assert_array_equal(read.sh0, loaded.appearance(names[0]).sh[:, 0].numpy())
+
+
+def test_files_of_other_programs_come_with_a_note_about_their_filter(
+    wildgs, trained: Path, tmp_path: Path, capsys
+) -> None:
+    assert api.load(trained).gaussians.antialiased
+    assert wildgs("export", trained, "--format", "ply", "--output", tmp_path) == 0
+    assert "antialiased" in capsys.readouterr().out
 
 
 def test_what_is_left_out_and_its_cost_are_printed(wildgs, trained: Path, tmp_path: Path, capsys) -> None:
