@@ -52,10 +52,9 @@ class Schedule:
         self.encoder_every = config.encoder_every
         self.mask_every = config.mask_every
         self.planes_every = config.planes_every
-        final = photos is not None and config.mask_visits > 0
-        self.mask_steps = (
-            min(steps, max(LEAST_MASK_STEPS, config.mask_visits * (photos or 0))) if final else steps
-        )
+        self.mask_steps = steps
+        if photos is not None and config.mask_visits:
+            self.mask_steps = min(steps, max(LEAST_MASK_STEPS, config.mask_visits * photos))
         self._factor = steps / REFERENCE_STEPS
         self.first_stage = self._scaled(config.first_stage, "first_stage")
         self.densify_from = self._scaled(config.densify_from, "densify_from")
@@ -78,11 +77,11 @@ class Schedule:
 
     def progress(self, step: int) -> float:
         """Fraction of the run that is done, 0 to 1."""
-        return min(step / max(self.steps - 1, 1), 1.0)
+        return _share(step, self.steps)
 
     def mask_progress(self, step: int) -> float:
         """Fraction of the mask's training that is done, 0 to 1."""
-        return min(step / max(self.mask_steps - 1, 1), 1.0)
+        return _share(step, self.mask_steps)
 
     def stage(self, step: int, sh_degree: int, taken: int = 1) -> Stage:
         """The stage at a step (from 0) that counts as `taken` steps; `sh_degree` is the method's full degree."""
@@ -121,6 +120,10 @@ class Schedule:
     def gathers(self, step: int) -> bool:
         """Whether view statistics are still needed for densification."""
         return self.densify_every > 0 and step < self.densify_until
+
+
+def _share(step: int, steps: int) -> float:
+    return min(step / max(steps - 1, 1), 1.0)
 
 
 def falls_on(step: int, taken: int, every: int) -> bool:
