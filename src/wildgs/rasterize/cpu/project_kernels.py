@@ -9,7 +9,6 @@ import numpy as np
 
 from wildgs.kernel_cache import njit
 from wildgs.rasterize.cpu.footprint_kernels import (
-    CHUNK,
     GROUP,
     LOG2_E,
     MIN_ALPHA,
@@ -28,30 +27,35 @@ from wildgs.rasterize.cpu.reach_kernels import (
 )
 from wildgs.rasterize.cpu.simd import lowest_bit, mask_bits, select, splat, vfloor, vlog2, vmax, vmin, vsqrt
 from wildgs.rasterize.cpu.simd_memory import vload, vload3, vstore, vstore2, vstore3, vstore8
+from wildgs.rasterize.cpu.tile_kernels import chunk_bounds, home_tile
 from wildgs.threads import fetch_add
 
 
 @njit(nogil=True)
 def project_forward(
     counter, means, quats, scales, opacities, view, lens, width, height, near,
-    means2d, depths, conics, compensations, radii, records, boxes, masks, tile_counts,
+    means2d, depths, conics, compensations, radii, records, boxes, masks, tile_counts, tiles_x, cursors,
 ):  # fmt: skip
     """Projects all Gaussians: centres, depths, conics, radii, blending records and the tiles that they reach.
+
+    `cursors` takes the number of Gaussians that reach tiles per (chunk, home tile), for `tile_kernels.move_home`.
 
     If `lens` says antialiased, `compensations` takes what opacities are multiplied with; else it may be empty.
 
     A Gaussian's tiles lie in its box (first and last tile, inclusive; packed by `pack_box`); where the box is at
     most 4 x 4 tiles, its mask has a bit per tile that is reached, else it is -1.
     """
-    n = depths.size
-    groups = (n + GROUP - 1) // GROUP
+    n, chunks = depths.size, cursors.shape[0]
     spans = np.empty(7 * GROUP, np.float32)
     while True:
-        first = fetch_add(counter, 1) * CHUNK
-        if first >= groups:
+        chunk = fetch_add(counter, 1)
+        if chunk >= chunks:
             break
-        for group in range(first, min(first + CHUNK, groups)):
-            i = min(group * GROUP, n - GROUP)
+        row = cursors[chunk]
+        row[:] = 0
+        begin, end = chunk_bounds(chunk, chunks, n)
+        for start in range(begin, end, GROUP):
+            i = min(start, n - GROUP)
             large = project_group(
                 i, means, quats, scales, opacities, view, lens, width, height, near,
                 means2d, depths, conics, compensations, records, spans,
@@ -75,6 +79,8 @@ def project_forward(
                     g, np.int64(spans[GROUP + lane]), np.int64(spans[2 * GROUP + lane]),
                     np.int64(spans[3 * GROUP + lane]), np.int64(spans[4 * GROUP + lane]), records,
                 )  # fmt: skip
+            for g in range(start, i + GROUP):  # the last group overlaps the one before
+                row[home_tile(boxes[g], tiles_x)] += min(tile_counts[g], 1)
 
 
 @njit(nogil=True)

@@ -16,6 +16,7 @@ from torch import Tensor
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.cpu import project_backward_kernels, project_kernels, tile_kernels
+from wildgs.rasterize.cpu.footprint_kernels import CHUNK, GROUP
 from wildgs.rasterize.cpu.reach_kernels import RECORD, TILE
 from wildgs.rasterize.interface import Projection
 from wildgs.threads import begin, flat, launch, run_once, thread_count
@@ -49,9 +50,6 @@ def _aligned(size: int, dtype: type) -> np.ndarray:
     raw = np.empty(size + 64 // item, dtype)
     skip = -raw.ctypes.data % 64 // item
     return raw[skip : skip + size]
-
-
-GROUP = project_kernels.GROUP
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ class _Lens:
 
     @staticmethod
     def of(camera: Camera, eps2d: float, antialiased: bool) -> _Lens:
-        K = camera.K.detach().to("cpu", torch.float32)
+        K = camera.K.detach().to("cpu", torch.float32).numpy()  # indexing a tensor costs ten times as much
         view = camera.viewmat.detach().to("cpu", torch.float32)[:3].contiguous().numpy().reshape(-1)
         lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], eps2d, antialiased], np.float32)
         return _Lens(view, lens, camera.width, camera.height)
@@ -142,7 +140,7 @@ class _Project(torch.autograd.Function):
 
 
 def _chunks(count: int) -> int:
-    return -(-count // (GROUP * project_kernels.CHUNK))
+    return -(-count // (GROUP * CHUNK))
 
 
 def project(
@@ -165,21 +163,25 @@ def project(
     conics, radii = torch.empty(count, 3), torch.empty(count, dtype=torch.int32)
     compensations = torch.empty(count if antialiased else 0)
     tile_counts = np.empty(count, np.int32)
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    chunks = max(1, min(max(8, 2 * thread_count()), count // 1024))
     with (
         scratch("records", count * RECORD, np.float32) as records,
         scratch("boxes", count, np.int64) as boxes,
         scratch("masks", count, np.int32) as masks,
+        scratch("cursors", chunks * (tiles_x * tiles_y + tiles_x + 2), np.int64) as counts,
     ):
+        cursors = counts.reshape(chunks, -1)
         launch(
             project_kernels.project_forward,
             *map(flat, (means_, quats_, scales_, opacities_)),
             *lens.arguments(),
             np.float32(near),
             *map(flat, (means2d, depths, conics, compensations, radii)),
-            records, boxes, masks, tile_counts,
-            items=_chunks(count),
+            records, boxes, masks, tile_counts, tiles_x, cursors,
+            items=chunks,
         )  # fmt: skip
-        tiles = _list_tiles(depths.numpy(), records, boxes, masks, tile_counts, camera)
+        tiles = _list_tiles(depths.numpy(), records, boxes, masks, tile_counts, cursors, (tiles_x, tiles_y))
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means_, quats_, scales_)):
         outputs = (means2d, depths, conics, compensations, radii)
         means2d, depths, conics, compensations = _Project.apply(means_, quats_, scales_, lens, outputs)  # type: ignore[misc]
@@ -202,26 +204,34 @@ def _list_tiles(
     boxes: np.ndarray,
     masks: np.ndarray,
     tile_counts: np.ndarray,
-    camera: Camera,
+    cursors: np.ndarray,
+    size: tuple[int, int],
 ) -> TileLists:
-    """Ranks the Gaussians and builds the depth-sorted tile lists (see `tile_kernels`)."""
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    n = tile_counts.size
-    seen = int(np.count_nonzero(tile_counts))
+    """Ranks the Gaussians and builds the depth-sorted tile lists (see `tile_kernels`).
+
+    Args:
+        depths: Depth of each Gaussian, with the results of `project_forward` in the order of its arguments.
+        records: As above.
+        boxes: As above.
+        masks: As above.
+        tile_counts: As above.
+        cursors: As above; overwritten.
+        size: Number of tiles in a row and in a column.
+    """
+    tiles_x, tiles_y = size
+    n, chunks = tile_counts.size, len(cursors)
+    offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
+    run_once(tile_kernels.place_chunks, cursors, offsets)
+    seen = int(offsets[-1])
     ranks, homes = np.empty(n, np.int32), np.empty(seen, np.int32)
     ranked_records, starts = np.empty(seen * RECORD, np.float32), np.empty(seen + 1, np.int64)
-    offsets = np.empty(tiles_x * tiles_y + 1, np.int64)
-    chunks = max(1, min(2 * thread_count(), n // 1024))
+    tile_order = np.empty(tiles_x * tiles_y, np.int64)
     with (
-        scratch("cursors", chunks * (tiles_x * tiles_y + tiles_x + 2), np.int64) as counts,
         scratch("spans", 4 * seen, np.int32) as spans,
         scratch("keys", 2 * seen, np.uint32) as keys,
         scratch("order", 2 * seen, np.int32) as order,
         scratch("nearest", seen, np.int32) as nearest,
     ):
-        cursors = counts.reshape(chunks, -1)
-        launch(tile_kernels.count_homes, tile_counts, boxes, tiles_x, cursors, items=chunks)
-        run_once(tile_kernels.place_chunks, cursors, offsets)
         ordered = begin(
             tile_kernels.sort_by_depth,
             depths, tile_counts, keys[:seen], order[:seen], keys[seen:], order[seen:],
@@ -241,10 +251,9 @@ def _list_tiles(
         if pairs >= 2**31:
             raise UserError(f"too many pairs of tile and Gaussian ({pairs:,}); render at a lower resolution")
         entries = np.empty(2 * pairs + 2, np.int32)
+        run_once(tile_kernels.order_tiles, offsets, tile_order)
         launch(
             tile_kernels.write_pairs, nearest, spans, ranked_records, starts, tiles_x, cursors, entries,
             items=chunks,
         )  # fmt: skip
-    # Sorted by powers of two of the length: tiles of similar length keep their order, for cache locality.
-    tile_order = np.argsort(-np.frexp(np.diff(offsets))[1], kind="stable")
     return TileLists(ranks, homes, ranked_records, starts, offsets, entries[:-2], tile_order)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from wildgs.kernel_cache import njit
+from wildgs.rasterize.cpu.footprint_kernels import GROUP
 from wildgs.rasterize.cpu.reach_kernels import RECORD, inside_bits, window_mask
 from wildgs.rasterize.cpu.simd import lowest_bit
 from wildgs.rasterize.cpu.simd_memory import copy8, prefetch, prefetch_to_write
@@ -30,18 +31,10 @@ def home_tile(box, tiles_x):
 
 
 @njit(nogil=True)
-def count_homes(counter, tile_counts, boxes, tiles_x, cursors):
-    """Gaussians that reach tiles per (chunk, home tile), into `cursors`."""
-    chunks, n = cursors.shape[0], tile_counts.size
-    while True:
-        chunk = fetch_add(counter, 1)
-        if chunk >= chunks:
-            break
-        row = cursors[chunk]
-        row[:] = 0
-        for g in range(chunk * n // chunks, (chunk + 1) * n // chunks):
-            if tile_counts[g] > 0:
-                row[home_tile(boxes[g], tiles_x)] += 1
+def chunk_bounds(chunk, chunks, n):
+    """First Gaussian of a chunk and the first after it, both at whole groups."""
+    groups = (n + GROUP - 1) // GROUP
+    return GROUP * (chunk * groups // chunks), min(GROUP * ((chunk + 1) * groups // chunks), n)
 
 
 @njit(nogil=True)
@@ -68,8 +61,8 @@ def move_home(
         if chunk >= chunks:
             break
         row = cursors[chunk]
-        end = (chunk + 1) * n // chunks
-        for first in range(chunk * n // chunks, end, AHEAD):
+        begin, end = chunk_bounds(chunk, chunks, n)
+        for first in range(begin, end, AHEAD):
             # Ranks first, so that the places that they point to are on their way when they are written.
             for g in range(first, min(first + AHEAD, end)):
                 ranks[g] = -1
@@ -127,15 +120,19 @@ def sort_by_depth(depths, tile_counts, keys, order, other_keys, other_order):
     passes = (width + DIGIT - 1) // DIGIT
     digit = (width + passes - 1) // max(passes, 1)
     for turn in range(passes):
-        radix_pass(seen, low, keys, order, other_keys, other_order, turn * digit, digit)
+        last = turn == passes - 1
+        radix_pass(seen, low, keys, order, other_keys, other_order, turn * digit, digit, last)
         keys, other_keys = other_keys, keys
         order, other_order = other_order, order
     return order
 
 
 @njit(nogil=True)
-def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
-    """One stable counting sort by the `digit` bits from bit `shift` on of the keys less `low`."""
+def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit, last):
+    """One stable counting sort by the `digit` bits from bit `shift` on of the keys less `low`.
+
+    The last pass does not write keys, which nobody reads.
+    """
     mask = (1 << digit) - 1
     cursor = np.zeros((1 << digit) + 1, np.int32)
     for i in range(count):
@@ -146,7 +143,8 @@ def radix_pass(count, low, keys, order, out_keys, out_order, shift, digit):
         d = ((int(keys[i]) - int(low)) >> shift) & mask
         at = cursor[d]
         cursor[d] = at + 1
-        out_keys[at] = keys[i]
+        if not last:
+            out_keys[at] = keys[i]
         out_order[at] = order[i]
 
 
@@ -261,6 +259,34 @@ def write_window(bits, first, tiles_x, rank, slot, row, entries):
 
 
 @njit(nogil=True)
+def order_tiles(offsets, out):
+    """Tiles in the order of processing, longest lists first, to balance the threads.
+
+    Lengths are compared by their number of bits: tiles of similar length keep their order, for cache locality.
+    """
+    starts = np.zeros(66, np.int64)
+    for tile in range(out.size):
+        starts[64 - bit_length(offsets[tile + 1] - offsets[tile])] += 1
+    total = 0
+    for k in range(starts.size):
+        starts[k], total = total, total + starts[k]
+    for tile in range(out.size):
+        k = 64 - bit_length(offsets[tile + 1] - offsets[tile])
+        out[starts[k]] = tile
+        starts[k] += 1
+
+
+@njit(nogil=True)
+def bit_length(number):
+    """Number of binary digits of a number that is not negative; 0 for 0."""
+    digits = 0
+    while number > 0:
+        number >>= 1
+        digits += 1
+    return digits
+
+
+@njit(nogil=True)
 def rank_values(counter, chunk_size, homes, depths, colors, channels, values):
     """Depth, then colours, of every rank: what blending adds up."""
     row = channels + 1
@@ -274,5 +300,10 @@ def rank_values(counter, chunk_size, homes, depths, colors, channels, values):
             prefetch(colors, channels * soon)
             g = homes[rank]
             values[rank * row] = depths[g]
+            if channels == 3:  # without a loop of unknown length
+                values[4 * rank + 1] = colors[3 * g]
+                values[4 * rank + 2] = colors[3 * g + 1]
+                values[4 * rank + 3] = colors[3 * g + 2]
+                continue
             for k in range(channels):
                 values[rank * row + 1 + k] = colors[channels * g + k]

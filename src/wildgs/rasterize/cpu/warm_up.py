@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from wildgs.rasterize.cpu.blending import _Blend
-from wildgs.rasterize.cpu.projection import GROUP, TileLists, _Lens, _Project
+from wildgs.rasterize.cpu.footprint_kernels import GROUP
+from wildgs.rasterize.cpu.projection import TileLists, _Lens, _Project
 from wildgs.rasterize.cpu.shading import _Shade
 
 
