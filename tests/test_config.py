@@ -91,6 +91,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert train["optimizer"].pop("short_runs") > 0
     assert train["objective"].pop("mask_weight_photos") > 0
     assert train["objective"].pop("mask_power") > 1
+    assert train["objective"].pop("consensus") is True
     assert train["objective"].pop("sky_weight") > 0
     assert train["density"].pop("min_visibility") > 0.5
     del model["camera_response"]
@@ -105,6 +106,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert not config.model.sky.own_fusion
     assert config.train.optimizer.short_runs == 0
     assert (config.train.objective.mask_weight_photos, config.train.objective.mask_power) == (0, 1)
+    assert config.train.objective.consensus is False
     assert config.train.objective.sky_weight == 0
     assert config.train.density.min_visibility == 0.5
     assert from_plain(RunConfig, to_plain(BASE)) == BASE

@@ -42,6 +42,7 @@ MENDED = {
     "train.objective.sky_weight": 0.0,
     "train.objective.mask_weight_photos": 0,
     "train.objective.mask_power": 1.0,
+    "train.objective.consensus": False,
     "train.schedule.encoder_every": 1,
     "train.schedule.reset_every": 3000,
     "train.schedule.mask_every": 1,

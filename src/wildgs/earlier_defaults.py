@@ -18,6 +18,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
     ("train", "objective", "mask_weight_photos"): ("mask_weight_end", 0),
     ("train", "objective", "mask_power"): ("mask_weight_end", 1.0),
+    ("train", "objective", "consensus"): ("mask_weight_end", False),
     ("train", "objective", "sky_weight"): ("mask_weight_end", 0.0),
     ("train", "density", "min_visibility"): ("least_pixels", 0.5),
     ("train", "schedule", "mask_every"): ("mask_pause", 1),

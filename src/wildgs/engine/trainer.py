@@ -14,6 +14,7 @@ from torch import Tensor
 
 from wildgs import features
 from wildgs.engine.config import TrainConfig
+from wildgs.engine.consensus import Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
@@ -86,6 +87,8 @@ class Trainer:
     """Trains a method on a scene's training photos.
 
     Attributes:
+        consensus: What may be transient in the training photos, as far as they have been compared.
+        on_compared_photo: Called with (photos done, total number of photos) while `begin` compares the photos.
         on_final_photo: Called with (photos done, total number of photos) during `Method.finish` after the last
             step.
         cuda_graphs: Whether networks are captured and replayed as CUDA graphs (on CUDA devices).
@@ -106,6 +109,7 @@ class Trainer:
             UserError: There are no training photos, or fewer than processes.
         """
         self.views = scene.train_views
+        self._scene = scene
         self.team = team or Team()
         if not self.views:
             raise UserError(
@@ -134,10 +138,12 @@ class Trainer:
         self.feed = PhotoFeed(
             self.views, self.sampler, self.team, self.device, observed_pixels(scene), scene.points
         )
+        self.consensus = Consensus(self.device)
         self.guard = StepGuard()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
         self.on_final_photo: Counter = lambda done, total: None
+        self.on_compared_photo: Counter = lambda done, total: None
         self.cuda_graphs = True
         self.feature_cache = FEATURE_CACHE_BYTES
 
@@ -175,6 +181,7 @@ class Trainer:
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
         keep_features(self.method, FeatureCache(self.feature_cache))
+        self._compare_photos()
 
     def end(self) -> None:
         """Undoes `begin`: float32, no CUDA graphs, and the previous settings of the process."""
@@ -304,7 +311,10 @@ class Trainer:
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,
             num_photos=len(self.views),
+            doubt=self.consensus.doubt(view.name),
         )
+        if output.visibility is not None:
+            self.consensus.observe(output.visibility)
         return output, losses
 
     def _control_density(self, taken: int) -> DensityReport | None:
@@ -341,6 +351,14 @@ class Trainer:
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
+    def _compare_photos(self) -> None:
+        """Finds what may be transient in the photos, if masks are still trained by evidence."""
+        objective, start = self.config.objective, time.perf_counter()
+        learned = objective.consensus and objective.mask_gradient == "evidence"
+        if learned and self.step < self.schedule.mask_steps:
+            self.consensus.compare(self.method, self._scene, self.feed, self.on_compared_photo)
+            self.seconds += time.perf_counter() - start
+
     def _finish(self) -> None:
         """Calls `Method.finish` with some training photos."""
         start = time.perf_counter()
@@ -368,6 +386,7 @@ class Trainer:
         state["progress.step"] = torch.tensor(self.step)
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
         state["progress.skipped"] = torch.tensor(self.guard.skipped)
+        state["progress.hidden"] = self.consensus.hidden
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -384,6 +403,7 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
+        self.consensus.hidden = state.get("progress.hidden", torch.zeros(2)).to(self.device)
         if self.step < self.config.steps:
             self.method.finish(())
 

@@ -231,6 +231,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
             logger.info(describe_carried(job.folder))
         trainer.cuda_graphs = job.execution.cuda_graphs
         trainer.feature_cache = parse_bytes(job.execution.feature_cache)
+        trainer.on_compared_photo = counter(job.progress, "comparing training photos")
         trainer.on_final_photo = counter(job.progress, "fitting the light of training photos")
         with ExitStack() as stack:
             if job.team.first:

@@ -27,6 +27,8 @@ class ObjectiveConfig:
             'evidence': a robust measure of how transient a pixel is
             (`wildgs.losses.evidence.transient_evidence`). Neither changes the loss nor its gradient to the
             render.
+        consensus: Whether, once masks hide more than passers-by usually cover, evidence counts only where other
+            photos do not show the same (`wildgs.priors.consensus`). Needs a frozen encoder. Not in the paper.
         min_alpha: Smallest accumulated alpha of a pixel that enters the depth loss.
     """
 
@@ -39,6 +41,7 @@ class ObjectiveConfig:
     metric_weight: float = 0.1
     sky_weight: float = 1.0
     mask_gradient: Literal["evidence", "loss"] = "evidence"
+    consensus: bool = True
     min_alpha: float = 0.5
 
     def mask_weight(self, progress: float, num_photos: int | None = None) -> float:

@@ -65,6 +65,7 @@ def total_loss(
     train_mask: bool = True,
     mask_threshold: float = 0.5,
     num_photos: int | None = None,
+    doubt: Float[Tensor, "_ _"] | None = None,
 ) -> Losses:
     """The paper's L_total for one photo.
 
@@ -85,6 +86,7 @@ def total_loss(
         train_mask: Whether the mask gets a gradient (False in the pause after an opacity reset).
         mask_threshold: Threshold Th of static pixels for the depth loss.
         num_photos: Number of training photos, on which λ^M depends; None for enough of them.
+        doubt: Degree to which pixels may be transient, in cells; see `masked_photometric`.
 
     Returns:
         All terms.
@@ -92,7 +94,7 @@ def total_loss(
     if visibility is not None and not train_mask:
         visibility = visibility.detach()
     proven = None if observations is None else proven_static(observations, *photo.shape[:2])
-    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven)
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven, doubt)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
@@ -118,12 +120,17 @@ def total_loss(
 
 
 def _image_loss(
-    config: ObjectiveConfig, photo: Tensor, render: Tensor, mask: Tensor | None, proven: Tensor | None
+    config: ObjectiveConfig,
+    photo: Tensor,
+    render: Tensor,
+    mask: Tensor | None,
+    proven: Tensor | None,
+    doubt: Tensor | None,
 ) -> Tensor:
     """L^I, with the configured gradient to the mask."""
     if mask is None or config.mask_gradient == "evidence":
         return masked_photometric(
-            photo, render, mask, config.weight_l1, power=config.mask_power, proven=proven
+            photo, render, mask, config.weight_l1, power=config.mask_power, proven=proven, doubt=doubt
         )
     mask = mask[..., None] ** config.mask_power
     return masked_photometric(photo * mask, render * mask, None, config.weight_l1)

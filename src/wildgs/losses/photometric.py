@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from wildgs.losses.evidence import PROOF, transient_evidence
 from wildgs.losses.ssim import ssim
@@ -18,6 +19,7 @@ def masked_photometric(
     *,
     power: float = 1.0,
     proven: Bool[Tensor, "H W"] | None = None,
+    doubt: Float[Tensor, "_ _"] | None = None,
 ) -> Float[Tensor, ""]:
     """``λ |I⊙M - Î⊙M| + (1 - λ) (1 - SSIM(I⊙M, Î⊙M))``, paper section 'Transient Objects Handling'.
 
@@ -35,6 +37,8 @@ def masked_photometric(
         weight_l1: λ.
         power: Exponent of M in the formula (paper: 1).
         proven: Pixels known to be static (`proven_static`); None for none.
+        doubt: Degree to which pixels may be transient, 0 to 1, a factor on the evidence, in cells that cover the
+            photo (`wildgs.priors.consensus.doubts`); None for 1 everywhere.
 
     Returns:
         The loss.
@@ -47,6 +51,9 @@ def masked_photometric(
     if visibility.requires_grad:
         # Adds zero to the value and the evidence to the mask's gradient.
         evidence = transient_evidence(photo, render.detach())
+        if doubt is not None:
+            cells = functional.interpolate(doubt[None, None], size=evidence.shape, mode="bilinear")
+            evidence = evidence * cells[0, 0]
         if proven is not None:
             evidence = torch.where(proven, -PROOF, evidence)
         loss = loss + ((visibility - fixed) * evidence).mean()

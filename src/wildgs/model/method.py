@@ -136,6 +136,15 @@ class Method(nn.Module, ABC):
         """Mask of the Gaussians that densification may clone, split, reset and prune; None for all."""
         return None
 
+    def place_features(self, photo: Float[Tensor, "H W 3"], name: str) -> Float[Tensor, "C h w"] | None:
+        """Features by which photos are compared before training (`wildgs.priors.consensus`); None for none.
+
+        Args:
+            photo: RGB in [0, 1].
+            name: Name of the training photo, for caching.
+        """
+        return None
+
     # Encode, shade, render.
 
     def prepare(self, photos: Sequence[Float[Tensor, "_ _ 3"]]) -> None:

@@ -154,6 +154,23 @@ class Parsing(MixedModule):
         bounded = _Bounded.apply(logits[0, 0]) if self.config.bounded_logits else logits[0, 0]
         return bounded.sigmoid(), embedding
 
+    @torch.no_grad()
+    def place_features(
+        self, photo: Float[Tensor, "H W 3"], name: str | None = None
+    ) -> Float[Tensor, "C h w"]:
+        """The two finest feature maps of a frozen encoder, at an eighth of the size at which photos are parsed.
+
+        Args:
+            photo: RGB in [0, 1].
+            name: Key for caching, see `forward`.
+        """
+        assert isinstance(self.encoder, SqueezeNetEncoder)
+        *raw, _ = unpack(*self._frozen_features(photo, name))
+        fine, coarse = self.encoder.standardize(raw)[:2]
+        fine = functional.interpolate(fine, size=coarse.shape[2:], mode="bilinear", align_corners=False)
+        # Both maps count the same, whatever their number of channels.
+        return torch.cat([x[0] / len(x[0]) ** 0.5 for x in (fine, coarse)])
+
     def _networks(
         self, image: Float[Tensor, "1 3 h w"], learn_encoder: bool, learn_mask: bool
     ) -> tuple[Float[Tensor, "1 1 u v"], Float[Tensor, " G"]]:

@@ -230,6 +230,12 @@ class WildGS(Method):
         """The mask M, by 2D Parsing only."""
         return self.parse(photo).visibility
 
+    def place_features(self, photo: Float[Tensor, "H W 3"], name: str) -> Float[Tensor, "C h w"] | None:
+        """Features of a frozen encoder; None without one or without a mask."""
+        if self._lacks("mask") or not self.parsing.encoder.frozen:
+            return None
+        return self.parsing.place_features(photo, name)
+
     def parse(
         self,
         photo: Float[Tensor, "H W 3"],

@@ -1,0 +1,100 @@
+"""Compares the training photos with each other, so that masks do not hide what all of them show."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wildgs.engine.feed import PhotoFeed
+from wildgs.model.method import Method
+from wildgs.priors.consensus import (
+    NEIGHBOURS,
+    consensus,
+    doubts,
+    nearest_depth,
+    principal_directions,
+    reduced,
+)
+from wildgs.priors.stereo.neighbours import choose_neighbours
+from wildgs.progress import Counter
+from wildgs.scene import Scene
+
+BASIS_PHOTOS = 64
+"""Number of photos from which principal components are computed."""
+USUAL, SUSPICIOUS = 0.12, 0.18
+"""Shares of hidden pixels up to which masks are trusted, and from which on consensus counts fully. Passers-by and
+coaches cover a tenth of the photos of a crowded square."""
+MEMORY = 0.98
+"""Weight of earlier photos in the running share of hidden pixels."""
+
+
+class Consensus:
+    """What may be transient in the training photos, as far as masks need to be told.
+
+    Masks are left alone while they hide no more than passers-by usually cover: where few photos are memorised,
+    passers-by have to be found early, and consensus, which is coarse, misses small ones. Masks that hide more than
+    that hide trees, façades or whole photos, and never show them again, because what is hidden is not learnt. From
+    then on, evidence counts only where consensus is low.
+
+    Attributes:
+        doubts: Degree to which each photo may be transient, in cells, by its name; see `priors.consensus.doubts`.
+        hidden: Running share of hidden pixels, and its maximum so far.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.doubts: dict[str, Float[Tensor, "_ _"]] = {}
+        self.hidden = torch.zeros(2, device=device)
+
+    @torch.no_grad()
+    def compare(self, method: Method, scene: Scene, feed: PhotoFeed, on_photo: Counter) -> None:
+        """Compares the photos; without features of the method, nothing is known about them.
+
+        Args:
+            method: Provides the features.
+            scene: The scene, whose points determine neighbours and depths.
+            feed: The photos; unreadable ones are left out.
+            on_photo: Called with (photos done, total number of photos).
+        """
+        views = scene.train_views
+        stride = -(-len(views) // BASIS_PHOTOS)
+        sample = [_features(method, feed, row, scene) for row in range(0, len(views), stride)]
+        sample = [features for features in sample if features is not None]
+        if not sample:
+            return
+        directions = principal_directions(sample)
+        compared = []  # reduced one by one, since features are four times as large
+        for row in range(len(views)):
+            features = _features(method, feed, row, scene)
+            compared.append(None if features is None else reduced(features, directions))
+        points = scene.points.to(directions.device)
+        found = {}
+        for row, others in enumerate(choose_neighbours(scene, NEIGHBOURS)):
+            mine, camera = compared[row], feed.camera(views[row])
+            nearest = nearest_depth(camera, points)
+            if mine is not None and nearest is not None:
+                shown = [(compared[other], feed.camera(views[other])) for other in others]
+                pairs = [(features, seen) for features, seen in shown if features is not None]
+                found[views[row].name] = consensus(mine, camera, pairs, nearest)
+            on_photo(row + 1, len(views))
+        self.doubts = dict(zip(found, doubts(list(found.values())), strict=True))
+
+    @torch.no_grad()
+    def observe(self, visibility: Float[Tensor, "H W"]) -> None:
+        """Takes account of the mask of one more photo, without synchronisation."""
+        share = torch.lerp((visibility < 0.5).float().mean(), self.hidden[0], MEMORY)
+        self.hidden = torch.stack([share, torch.maximum(share, self.hidden[1])])
+
+    @torch.no_grad()
+    def doubt(self, name: str) -> Float[Tensor, "_ _"] | None:
+        """Factor on the evidence in cells of a photo, 0 to 1; None for 1 everywhere."""
+        found = self.doubts.get(name)
+        if found is None:
+            return None
+        strength = ((self.hidden[1] - USUAL) / (SUSPICIOUS - USUAL)).clamp(0, 1)
+        return 1 - strength * (1 - found)
+
+
+def _features(method: Method, feed: PhotoFeed, row: int, scene: Scene) -> Float[Tensor, "C h w"] | None:
+    view = scene.train_views[row]
+    return method.place_features(feed.photo(view)[0], view.name) if feed.is_readable(view) else None

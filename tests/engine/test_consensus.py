@@ -1,0 +1,114 @@
+"""Consensus of training photos within a run: when it is found, when it counts, and that it is resumed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.engine.test_trainer import trainer_for
+from wildgs.engine.consensus import SUSPICIOUS, USUAL, Consensus
+from wildgs.losses.config import ObjectiveConfig
+from wildgs.losses.photometric import masked_photometric
+from wildgs.model.config import SQUEEZENET
+from wildgs.model.wildgs import WildGSConfig
+from wildgs.scene import Scene
+
+pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
+
+
+@pytest.fixture
+def frozen_model(tiny_model: WildGSConfig) -> WildGSConfig:
+    return replace(tiny_model, parsing=replace(tiny_model.parsing, encoder=SQUEEZENET))
+
+
+def with_doubt(hidden: float) -> Consensus:
+    consensus = Consensus(torch.device("cpu"))
+    consensus.doubts = {"a": torch.tensor([[0.0, 0.25, 1.0]])}
+    consensus.hidden = torch.tensor([0.0, hidden])
+    return consensus
+
+
+def test_every_photo_is_compared_when_training_begins(wall_scene: Scene, frozen_model: WildGSConfig) -> None:
+    trainer, seen = trainer_for(wall_scene, frozen_model, 5), []
+    trainer.on_compared_photo = lambda done, total: seen.append((done, total))
+    trainer.begin()
+    trainer.end()
+    photos = len(wall_scene.train_views)
+    assert seen == [(done + 1, photos) for done in range(photos)]
+    assert set(trainer.consensus.doubts) == {view.name for view in wall_scene.train_views}
+    for doubt in trainer.consensus.doubts.values():
+        assert ((doubt >= 0) & (doubt <= 1)).all()
+
+
+@pytest.mark.parametrize(
+    "objective", [ObjectiveConfig(consensus=False), ObjectiveConfig(mask_gradient="loss")]
+)
+def test_photos_are_not_compared_where_nothing_reads_it(
+    wall_scene: Scene, frozen_model: WildGSConfig, objective: ObjectiveConfig
+) -> None:
+    trainer = trainer_for(wall_scene, frozen_model, 5, objective=objective)
+    trainer.begin()
+    trainer.end()
+    assert not trainer.consensus.doubts
+    assert trainer.consensus.doubt(wall_scene.train_views[0].name) is None
+
+
+def test_methods_without_a_frozen_encoder_have_no_features_to_compare(
+    wall_scene: Scene, tiny_model: WildGSConfig
+) -> None:
+    trainer = trainer_for(wall_scene, tiny_model, 5, "3dgs")
+    trainer.begin()
+    trainer.end()
+    assert not trainer.consensus.doubts
+
+
+def test_consensus_counts_once_masks_have_hidden_too_much() -> None:
+    full, none = with_doubt(SUSPICIOUS).doubt("a"), with_doubt(USUAL).doubt("a")
+    half = with_doubt((USUAL + SUSPICIOUS) / 2).doubt("a")
+    assert full is not None
+    assert none is not None
+    assert half is not None
+    torch.testing.assert_close(full, torch.tensor([[0.0, 0.25, 1.0]]))
+    torch.testing.assert_close(none, torch.ones(1, 3))
+    torch.testing.assert_close(half, torch.tensor([[0.5, 0.625, 1.0]]))
+    assert with_doubt(1.0).doubt("b") is None
+
+
+def test_the_share_of_hidden_pixels_is_remembered_at_its_maximum() -> None:
+    consensus = Consensus(torch.device("cpu"))
+    for _ in range(200):
+        consensus.observe(torch.tensor([[0.2, 0.9], [0.9, 0.9]]))
+    assert consensus.hidden.tolist() == pytest.approx([0.25, 0.25], abs=0.01)
+    for _ in range(200):
+        consensus.observe(torch.ones(2, 2))
+    assert consensus.hidden.tolist() == pytest.approx([0.0, 0.25], abs=0.01)
+
+
+def test_doubt_is_a_factor_on_the_evidence() -> None:
+    generator = torch.Generator().manual_seed(0)
+    photo, render = torch.rand(24, 32, 3, generator=generator), torch.zeros(24, 32, 3)
+    gradients = []
+    for doubt in (None, torch.ones(3, 4), torch.full((3, 4), 0.5), torch.zeros(3, 4)):
+        visibility = torch.full((24, 32), 0.8, requires_grad=True)
+        loss = masked_photometric(photo, render, visibility, doubt=doubt)
+        gradients.append((loss.item(), *torch.autograd.grad(loss, visibility)))
+    (value, plain), (_, all_), (_, half), (last, none) = gradients
+    assert plain.abs().max() > 0
+    torch.testing.assert_close(all_, plain)
+    torch.testing.assert_close(half, plain / 2)
+    assert not none.any()
+    assert value == last
+
+
+def test_a_resumed_run_continues_with_the_same_share(wall_scene: Scene, frozen_model: WildGSConfig) -> None:
+    first = trainer_for(wall_scene, frozen_model, 5)
+    first.consensus.hidden = torch.tensor([0.1, 0.3])
+    second = trainer_for(wall_scene, frozen_model, 5)
+    second.restore(first.state())
+    assert second.consensus.hidden.tolist() == pytest.approx([0.1, 0.3])
+    earlier = first.state()
+    del earlier["progress.hidden"]
+    second.restore(earlier)
+    assert second.consensus.hidden.tolist() == [0, 0]
