@@ -9,6 +9,7 @@ import torch
 
 from tests.engine.test_trainer import trainer_for
 from wildgs.engine.consensus import SUSPICIOUS, USUAL, Consensus
+from wildgs.engine.trainer import Trainer
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.losses.photometric import masked_photometric
 from wildgs.model.config import SQUEEZENET
@@ -23,17 +24,27 @@ def frozen_model(tiny_model: WildGSConfig) -> WildGSConfig:
     return replace(tiny_model, parsing=replace(tiny_model.parsing, encoder=SQUEEZENET))
 
 
-def with_doubt(hidden: float) -> Consensus:
+def with_doubt(largest: float) -> Consensus:
     consensus = Consensus(torch.device("cpu"))
     consensus.doubts = {"a": torch.tensor([[0.0, 0.25, 1.0]])}
-    consensus.hidden = torch.tensor([0.0, hidden])
+    consensus.largest = largest
     return consensus
 
 
-def test_every_photo_is_compared_when_training_begins(wall_scene: Scene, frozen_model: WildGSConfig) -> None:
-    trainer, seen = trainer_for(wall_scene, frozen_model, 5), []
+def hide_everything(trainer: Trainer, share: float = 1.0) -> None:
+    trainer.consensus.hidden = torch.tensor([share, share])
+
+
+def test_photos_are_compared_once_masks_hide_too_much(wall_scene: Scene, frozen_model: WildGSConfig) -> None:
+    trainer, seen = trainer_for(wall_scene, frozen_model, 3), []
     trainer.on_compared_photo = lambda done, total: seen.append((done, total))
     trainer.begin()
+    trainer.advance()
+    assert not trainer.consensus.compared  # masks have hidden nothing yet
+    hide_everything(trainer)
+    trainer.step = 0  # in which the share is read
+    trainer.advance()
+    trainer.advance()
     trainer.end()
     photos = len(wall_scene.train_views)
     assert seen == [(done + 1, photos) for done in range(photos)]
@@ -48,9 +59,9 @@ def test_every_photo_is_compared_when_training_begins(wall_scene: Scene, frozen_
 def test_photos_are_not_compared_where_nothing_reads_it(
     wall_scene: Scene, frozen_model: WildGSConfig, objective: ObjectiveConfig
 ) -> None:
-    trainer = trainer_for(wall_scene, frozen_model, 5, objective=objective)
-    trainer.begin()
-    trainer.end()
+    trainer = trainer_for(wall_scene, frozen_model, 1, objective=objective)
+    hide_everything(trainer)
+    trainer.run()
     assert not trainer.consensus.doubts
     assert trainer.consensus.doubt(wall_scene.train_views[0].name) is None
 
@@ -58,9 +69,9 @@ def test_photos_are_not_compared_where_nothing_reads_it(
 def test_methods_without_a_frozen_encoder_have_no_features_to_compare(
     wall_scene: Scene, tiny_model: WildGSConfig
 ) -> None:
-    trainer = trainer_for(wall_scene, tiny_model, 5, "3dgs")
-    trainer.begin()
-    trainer.end()
+    trainer = trainer_for(wall_scene, tiny_model, 1, "3dgs")
+    hide_everything(trainer)
+    trainer.run()
     assert not trainer.consensus.doubts
 
 
@@ -102,13 +113,35 @@ def test_doubt_is_a_factor_on_the_evidence() -> None:
     assert value == last
 
 
-def test_a_resumed_run_continues_with_the_same_share(wall_scene: Scene, frozen_model: WildGSConfig) -> None:
-    first = trainer_for(wall_scene, frozen_model, 5)
-    first.consensus.hidden = torch.tensor([0.1, 0.3])
-    second = trainer_for(wall_scene, frozen_model, 5)
+def test_a_resumed_run_compares_where_the_first_one_did(
+    wall_scene: Scene, frozen_model: WildGSConfig
+) -> None:
+    first = trainer_for(wall_scene, frozen_model, 4)
+    hide_everything(first, 0.15)
+    first.begin()
+    first.advance()
+    second = trainer_for(wall_scene, frozen_model, 4)
+    second.method.load_state_dict(first.method.state_dict())
     second.restore(first.state())
-    assert second.consensus.hidden.tolist() == pytest.approx([0.1, 0.3])
-    earlier = first.state()
+    second.begin()
+    for trainer in (first, second):
+        trainer.advance()
+        trainer.end()
+    name = wall_scene.train_views[0].name
+    expected, found = first.consensus.doubt(name), second.consensus.doubt(name)
+    assert expected is not None
+    assert found is not None
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    torch.testing.assert_close(second.consensus.hidden, first.consensus.hidden)
+
+
+def test_checkpoints_of_earlier_versions_have_hidden_nothing(
+    wall_scene: Scene, frozen_model: WildGSConfig
+) -> None:
+    trainer = trainer_for(wall_scene, frozen_model, 5)
+    earlier = trainer.state()
     del earlier["progress.hidden"]
-    second.restore(earlier)
-    assert second.consensus.hidden.tolist() == [0, 0]
+    hide_everything(trainer)
+    trainer.restore(earlier)
+    assert trainer.consensus.hidden.tolist() == [0, 0]
+    assert not trainer.consensus.missing

@@ -22,11 +22,13 @@ from wildgs.scene import Scene
 
 BASIS_PHOTOS = 64
 """Number of photos from which principal components are computed."""
-USUAL, SUSPICIOUS = 0.12, 0.18
+USUAL, SUSPICIOUS = 0.12, 0.15
 """Shares of hidden pixels up to which masks are trusted, and from which on consensus counts fully. Passers-by and
 coaches cover a tenth of the photos of a crowded square."""
 MEMORY = 0.98
 """Weight of earlier photos in the running share of hidden pixels."""
+CHECK_EVERY = 50
+"""Interval of steps in which the share is read, which waits for the device."""
 
 
 class Consensus:
@@ -35,16 +37,38 @@ class Consensus:
     Masks are left alone while they hide no more than passers-by usually cover: where few photos are memorised,
     passers-by have to be found early, and consensus, which is coarse, misses small ones. Masks that hide more than
     that hide trees, façades or whole photos, and never show them again, because what is hidden is not learnt. From
-    then on, evidence counts only where consensus is low.
+    then on, evidence counts only where consensus is low. Photos are not compared before that.
 
     Attributes:
         doubts: Degree to which each photo may be transient, in cells, by its name; see `priors.consensus.doubts`.
         hidden: Running share of hidden pixels, and its maximum so far.
+        largest: The maximum as of the last `check`.
+        compared: Whether the photos have been compared.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.doubts: dict[str, Float[Tensor, "_ _"]] = {}
         self.hidden = torch.zeros(2, device=device)
+        self.largest = 0.0
+        self.compared = False
+
+    @property
+    def missing(self) -> bool:
+        """Whether the photos have to be compared now."""
+        return self.largest > USUAL and not self.compared
+
+    def check(self) -> None:
+        """Reads how much masks have hidden."""
+        self.largest = float(self.hidden[1])
+
+    def state(self) -> Float[Tensor, " 3"]:
+        """What `restore` needs to continue in the same way."""
+        return torch.cat([self.hidden.cpu(), torch.tensor([self.largest])])
+
+    def restore(self, state: Float[Tensor, " 3"]) -> None:
+        """Continues from `state`."""
+        self.hidden = state[:2].to(self.hidden)
+        self.largest = float(state[2])
 
     @torch.no_grad()
     def compare(self, method: Method, scene: Scene, feed: PhotoFeed, on_photo: Counter) -> None:
@@ -56,6 +80,7 @@ class Consensus:
             feed: The photos; unreadable ones are left out.
             on_photo: Called with (photos done, total number of photos).
         """
+        self.compared = True
         views = scene.train_views
         stride = -(-len(views) // BASIS_PHOTOS)
         sample = [_features(method, feed, row, scene) for row in range(0, len(views), stride)]
@@ -91,7 +116,7 @@ class Consensus:
         found = self.doubts.get(name)
         if found is None:
             return None
-        strength = ((self.hidden[1] - USUAL) / (SUSPICIOUS - USUAL)).clamp(0, 1)
+        strength = min(max((self.largest - USUAL) / (SUSPICIOUS - USUAL), 0.0), 1.0)
         return 1 - strength * (1 - found)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from wildgs import features
 from wildgs.engine.config import TrainConfig
-from wildgs.engine.consensus import Consensus
+from wildgs.engine.consensus import CHECK_EVERY, Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
@@ -88,7 +88,7 @@ class Trainer:
 
     Attributes:
         consensus: What may be transient in the training photos, as far as they have been compared.
-        on_compared_photo: Called with (photos done, total number of photos) while `begin` compares the photos.
+        on_compared_photo: Called with (photos done, total number of photos) when the photos are compared.
         on_final_photo: Called with (photos done, total number of photos) during `Method.finish` after the last
             step.
         cuda_graphs: Whether networks are captured and replayed as CUDA graphs (on CUDA devices).
@@ -181,7 +181,6 @@ class Trainer:
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
         keep_features(self.method, FeatureCache(self.feature_cache))
-        self._compare_photos()
 
     def end(self) -> None:
         """Undoes `begin`: float32, no CUDA graphs, and the previous settings of the process."""
@@ -193,6 +192,7 @@ class Trainer:
     def advance(self) -> StepReport:
         """Takes one step with one photo per rank."""
         start = time.perf_counter()
+        self._watch_masks()
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
@@ -351,13 +351,15 @@ class Trainer:
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
-    def _compare_photos(self) -> None:
-        """Finds what may be transient in the photos, if masks are still trained by evidence."""
-        objective, start = self.config.objective, time.perf_counter()
-        learned = objective.consensus and objective.mask_gradient == "evidence"
-        if learned and self.step < self.schedule.mask_steps:
+    def _watch_masks(self) -> None:
+        """Compares the photos if masks, while they are trained by evidence, have hidden too much."""
+        objective = self.config.objective
+        if not objective.consensus or objective.mask_gradient != "evidence":
+            return
+        if falls_on(self.step, self.team.size, CHECK_EVERY):
+            self.consensus.check()
+        if self.consensus.missing and self.step < self.schedule.mask_steps:
             self.consensus.compare(self.method, self._scene, self.feed, self.on_compared_photo)
-            self.seconds += time.perf_counter() - start
 
     def _finish(self) -> None:
         """Calls `Method.finish` with some training photos."""
@@ -386,7 +388,7 @@ class Trainer:
         state["progress.step"] = torch.tensor(self.step)
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
         state["progress.skipped"] = torch.tensor(self.guard.skipped)
-        state["progress.hidden"] = self.consensus.hidden
+        state["progress.hidden"] = self.consensus.state()
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -403,7 +405,7 @@ class Trainer:
         self.step = int(state["progress.step"])
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
-        self.consensus.hidden = state.get("progress.hidden", torch.zeros(2)).to(self.device)
+        self.consensus.restore(state.get("progress.hidden", torch.zeros(3)))
         if self.step < self.config.steps:
             self.method.finish(())
 

@@ -137,7 +137,7 @@ class Method(nn.Module, ABC):
         return None
 
     def place_features(self, photo: Float[Tensor, "H W 3"], name: str) -> Float[Tensor, "C h w"] | None:
-        """Features by which photos are compared before training (`wildgs.priors.consensus`); None for none.
+        """Features by which photos are compared (`wildgs.priors.consensus`); None for none.
 
         Args:
             photo: RGB in [0, 1].

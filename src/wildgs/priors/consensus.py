@@ -1,4 +1,4 @@
-"""How well other photos agree with each place of a photo, before anything is trained.
+"""How well other photos agree with each place of a photo, whatever has been trained.
 
 A passer-by is in one photo only, whereas trees, statues and arches are in all photos of the place, under other
 light and perhaps with other leaves. Features of a pretrained network depend little on light. They are compared by
