@@ -117,7 +117,7 @@ def test_a_resumed_run_compares_where_the_first_one_did(
     wall_scene: Scene, frozen_model: WildGSConfig
 ) -> None:
     first = trainer_for(wall_scene, frozen_model, 4)
-    hide_everything(first, 0.15)
+    hide_everything(first, (USUAL + SUSPICIOUS) / 2)
     first.begin()
     first.advance()
     second = trainer_for(wall_scene, frozen_model, 4)
