@@ -24,7 +24,7 @@ BASIS_PHOTOS = 64
 """Number of photos from which principal components are computed."""
 USUAL, SUSPICIOUS = 0.18, 0.22
 """Shares of hidden pixels up to which masks are trusted, and from which on consensus counts fully. Passers-by and
-coaches cover a tenth of the photos of a crowded square, of which masks hide up to 16% at first if photos are few."""
+coaches cover a tenth of the photos of a crowded square; masks hide up to 16% of them at first if photos are few."""
 MEMORY = 0.98
 """Weight of earlier photos in the running share of hidden pixels."""
 CHECK_EVERY = 50
