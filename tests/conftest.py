@@ -12,7 +12,6 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 from wildgs.processes import LIBRARY_DEFAULTS
@@ -34,10 +33,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
     for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "WILDGS_NUM_THREADS"):
         os.environ[_name] = str(_threads)
-
-# How long examples take to draw depends on what else runs on the machine, as does how long they run.
-settings.register_profile("shared machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("shared machine")
 
 SOURCE = Path(__file__).parent.parent / "src"
 SHARED = Path(__file__).parents[2] / "shared"

@@ -51,11 +51,7 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, dic
 
 @pytest.mark.parametrize("name", list(fuzz.READERS))
 @given(st.integers(0, 2**32))
-@settings(
-    max_examples=60,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_reader_breaks(seeds, name: str, seed: int) -> None:
     folder, contents = seeds[name]
     rng = random.Random(seed)
