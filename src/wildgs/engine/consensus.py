@@ -18,7 +18,7 @@ from wildgs.priors.consensus import (
 )
 from wildgs.priors.stereo.neighbours import choose_neighbours
 from wildgs.progress import Counter
-from wildgs.scene import Scene
+from wildgs.scene import Scene, View
 
 BASIS_PHOTOS = 64
 """Number of photos from which principal components are computed."""
@@ -83,14 +83,14 @@ class Consensus:
         self.compared = True
         views = scene.train_views
         stride = -(-len(views) // BASIS_PHOTOS)
-        sample = [_features(method, feed, row, scene) for row in range(0, len(views), stride)]
+        sample = [_features(method, feed, view) for view in views[::stride]]
         sample = [features for features in sample if features is not None]
         if not sample:
             return
         directions = principal_directions(sample)
         compared = []  # reduced one by one, since features are four times as large
-        for row in range(len(views)):
-            features = _features(method, feed, row, scene)
+        for view in views:
+            features = _features(method, feed, view)
             compared.append(None if features is None else reduced(features, directions))
         points = scene.points.to(directions.device)
         found = {}
@@ -120,6 +120,5 @@ class Consensus:
         return 1 - strength * (1 - found)
 
 
-def _features(method: Method, feed: PhotoFeed, row: int, scene: Scene) -> Float[Tensor, "C h w"] | None:
-    view = scene.train_views[row]
+def _features(method: Method, feed: PhotoFeed, view: View) -> Float[Tensor, "C h w"] | None:
     return method.place_features(feed.photo(view)[0], view.name) if feed.is_readable(view) else None

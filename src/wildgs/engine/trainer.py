@@ -313,7 +313,7 @@ class Trainer:
             num_photos=len(self.views),
             doubt=self.consensus.doubt(view.name),
         )
-        if output.visibility is not None:
+        if output.visibility is not None and self._watches_masks:
             self.consensus.observe(output.visibility)
         return output, losses
 
@@ -351,14 +351,20 @@ class Trainer:
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
-    def _watch_masks(self) -> None:
-        """Compares the photos if masks, while they are trained by evidence, have hidden too much."""
+    @property
+    def _watches_masks(self) -> bool:
+        """Whether masks are trained by evidence in this part of the run."""
         objective = self.config.objective
-        if not objective.consensus or objective.mask_gradient != "evidence":
+        evident = objective.consensus and objective.mask_gradient == "evidence"
+        return evident and self.step < self.schedule.mask_steps
+
+    def _watch_masks(self) -> None:
+        """Compares the photos if masks have hidden too much."""
+        if not self._watches_masks:
             return
         if falls_on(self.step, self.team.size, CHECK_EVERY):
             self.consensus.check()
-        if self.consensus.missing and self.step < self.schedule.mask_steps:
+        if self.consensus.missing:
             self.consensus.compare(self.method, self._scene, self.feed, self.on_compared_photo)
 
     def _finish(self) -> None:
