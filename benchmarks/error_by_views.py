@@ -25,7 +25,6 @@ import wildgs
 from wildgs.geometry.camera import Camera
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import blend
-from wildgs.scene.split import find_split_file, read_split
 
 LIMITS = (0.0, 1.0, 3.0, 6.0, 12.0, 24.0, float("inf"))
 LEAST_WEIGHT = 1.0
@@ -51,39 +50,33 @@ def squared_error(render: Path, truth: Path) -> Float[np.ndarray, "H W"]:
 
 
 @torch.no_grad()
-def by_views(run: Path, scene: Path, held_out: set[str]) -> list[tuple[float, float]]:
+def by_views(run: Path, scene: Path) -> list[tuple[float, float]]:
     """Share of pixels and contribution to the mean squared error for each interval of `LIMITS`."""
     loaded = wildgs.load(run)
-    gaussians = loaded.gaussians
+    gaussians, photos = loaded.gaussians, loaded.scene
     with torch.enable_grad():
-        seen = number_of_views(gaussians, (view.camera for view in loaded.views if view.name not in held_out))
+        seen = number_of_views(gaussians, (view.camera for view in photos.train_views))
     columns: list[list[tuple[float, float]]] = [[] for _ in LIMITS[1:]]
-    for view in loaded.views:
+    for view in photos.test_views:
         render = run / "eval" / "full" / f"{Path(view.name).stem}.png"
-        if view.name not in held_out or not render.exists():
-            continue
         clean = scene / "truth" / "clean" / render.name
         error = squared_error(render, clean if clean.exists() else scene / "images" / view.name)
         views = blend(gaussians.project(view.camera), seen[:, None].expand(-1, 3)).colors[..., 0].numpy()
         for column, low, high in zip(columns, LIMITS, LIMITS[1:], strict=False):
             inside = (views >= low) & (views < high)
             column.append((float(inside.mean()), float((error * inside).mean())))
-    return [(float(np.mean([a for a, _ in c])), float(np.mean([e for _, e in c]))) for c in columns]
+    return [(share, error) for share, error in np.mean(columns, axis=1).tolist()]
 
 
 def main() -> None:
     """Prints two lines per run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("scene", type=Path, help="scene folder with images/ and a split file")
+    parser.add_argument("scene", type=Path, help="scene folder with images/")
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
     options = parser.parse_args()
-    split = find_split_file(options.scene)
-    if split is None:
-        raise SystemExit(f"{options.scene}: no split file")
-    held_out = {name for name, part in read_split(split).items() if part == "test"}
     print("views      " + " ".join(f"{low:>4.0f}-{high:<4.0f}" for low, high in pairwise(LIMITS)))
     for run in options.runs:
-        table = by_views(run, options.scene, held_out)
+        table = by_views(run, options.scene)
         print(run)
         print("  pixels   " + " ".join(f"{share:9.3f}" for share, _ in table))
         print("  error    " + " ".join(f"{1e5 * error:9.2f}" for _, error in table))
