@@ -30,6 +30,7 @@ MENDED = {
     "model.wrapping.partial_lifts": 0.0,
     "model.ground.points": 0,
     "model.sky.points": 0,
+    "train.dropout.rate": 0.0,
     "model.sky.densify": True,
     "model.color_match": False,
     "model.light_codes": 0,

@@ -61,6 +61,7 @@ _PAPER: dict[str, Any] = {
     "train.schedule.mask_visits": 0,
     "train.schedule.planes_every": 1,
     "train.optimizer.short_runs": 0.0,
+    "train.dropout.rate": 0.0,
     "train.density.strategy": "classic",
     "train.density.prune_by_distance": False,
     "train.density.prune_reach": 0.0,

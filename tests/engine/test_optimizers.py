@@ -44,7 +44,9 @@ def test_rows_and_moments_stay_aligned(kept: list[bool], added: int) -> None:
     before = {name: rows.detach().clone() for name, rows in gaussians.rows.items()}
     old_moments = {name: moments(method, optimizers, name).clone() for name in before}
     new = {name: torch.randn(added, *rows.shape[1:]) for name, rows in before.items()}
-    edit_rows(gaussians, optimizers.rows, keep, new)
+    gaussians.photos = torch.arange(12.0)
+    edit_rows(gaussians, optimizers.rows, keep, new | {"photos": torch.full((added,), 50.0)})
+    assert gaussians.photos.tolist() == [n for n in range(12) if kept[n]] + [50.0] * added
     for name in before:
         expected = torch.cat([before[name][keep], new[name]])
         assert torch.equal(gaussians.rows[name].detach(), expected)

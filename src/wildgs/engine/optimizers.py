@@ -173,7 +173,7 @@ def edit_rows(
         gaussians: Edited in place.
         optimizer: Optimiser with one group per entry of `gaussians.rows`.
         keep: Gaussians to keep.
-        added: Parameters of the new Gaussians; their Adam moments are zero.
+        added: Parameters of the new Gaussians, and `Gaussians.photos` if there is any; their Adam moments are zero.
         sort: Whether to sort all Gaussians in Morton order (`sort_rows`); else the new ones are appended.
 
     Returns:
@@ -234,6 +234,8 @@ def _change_rows(
             optimizer.state[new] = state
         group["params"] = [new]
         gaussians.rows[name] = new
+    if gaussians.photos is not None:
+        gaussians.photos = change("photos", gaussians.photos, False)
 
 
 @torch.no_grad()

@@ -18,12 +18,14 @@ from wildgs.engine.consensus import CHECK_EVERY, Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
+from wildgs.engine.photo_counts import count_photos, is_due
 from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.schedule import Schedule, falls_on
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
+from wildgs.model.dropout import dropout_rates
 from wildgs.model.method import Method
 from wildgs.model.parsing import FeatureCache, keep_features
 from wildgs.model.precision import (
@@ -193,6 +195,7 @@ class Trainer:
         """Takes one step with one photo per rank."""
         start = time.perf_counter()
         self._watch_masks()
+        self._count_photos()
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
@@ -289,9 +292,9 @@ class Trainer:
         sky: Bool[Tensor, "H W"] | None,
     ) -> tuple[TrainingOutput, Losses]:
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        dropout = self.config.dropout
-        rate = dropout.rate_at(self.schedule.progress(self.step), len(self.views))
-        stage = replace(stage, dropout=rate, neighbours=dropout.neighbours, absgrad=self.density.absgrad)
+        dropout, photos = self.config.dropout, self.method.gaussians.photos
+        rates = dropout_rates(dropout, photos) if self._drops and photos is not None else None
+        stage = replace(stage, dropout=rates, neighbours=dropout.neighbours, absgrad=self.density.absgrad)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
@@ -367,6 +370,16 @@ class Trainer:
         if self.consensus.missing:
             self.consensus.compare(self.method, self._scene, self.feed, self.on_compared_photo)
 
+    @property
+    def _drops(self) -> bool:
+        """Whether Gaussians that few photos show are dropped at random."""
+        return self.method.uses_dropout and self.config.dropout.rate > 0
+
+    def _count_photos(self) -> None:
+        """Counts the photos that show each Gaussian, if it is time."""
+        if self._drops and is_due(self.step, self.team.size, self.config.steps):
+            self.method.gaussians.photos = count_photos(self.method.gaussians, self.feed)
+
     def _finish(self) -> None:
         """Calls `Method.finish` with some training photos."""
         start = time.perf_counter()
@@ -395,6 +408,8 @@ class Trainer:
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
         state["progress.skipped"] = torch.tensor(self.guard.skipped)
         state["progress.hidden"] = self.consensus.state()
+        if self.method.gaussians.photos is not None:
+            state["dropout.photos"] = self.method.gaussians.photos
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -412,6 +427,8 @@ class Trainer:
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
         self.consensus.restore(state.get("progress.hidden", torch.zeros(3)))
+        photos = state.get("dropout.photos")
+        self.method.gaussians.photos = None if photos is None else photos.to(self.device)
         if self.step < self.config.steps:
             self.method.finish(())
 

@@ -317,24 +317,14 @@ class VanillaConfig:
 
 @dataclass(frozen=True)
 class DropoutConfig:
-    """Dropout of Gaussians in training (`wildgs.model.dropout`). Not in the paper.
+    """Dropout of Gaussians that few photos show (`wildgs.model.dropout`). Not in the paper.
 
     Attributes:
-        rate: Dropout rate at the last step for a scene with very few photos; it grows linearly from 0. 0 = off.
-        photos: Number of training photos from which nothing is dropped; the rate falls linearly up to it.
+        rate: Dropout rate of Gaussians that at most a quarter of --dropout.photos show. 0 = off.
+        photos: Gaussians that this many training photos show are not dropped; the rate falls linearly up to it.
         neighbours: Number of neighbouring Gaussians that are dropped together.
     """
 
-    rate: float = 0.0
-    photos: int = 50
+    rate: float = 0.2
+    photos: int = 12
     neighbours: int = 8
-
-    def rate_at(self, progress: float, photos: int) -> float:
-        """The dropout rate at a point of training.
-
-        Args:
-            progress: Fraction of the training done, 0 to 1.
-            photos: Number of training photos.
-        """
-        few = 1.0 - photos / self.photos if self.photos else 0.0
-        return self.rate * min(max(progress, 0.0), 1.0) * max(0.0, few)

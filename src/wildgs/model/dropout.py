@@ -1,7 +1,8 @@
-"""Dropout of Gaussians, against overfitting to few photos.
+"""Dropout of Gaussians that few photos show, against overfitting to these photos.
 
-With few photos, Gaussians close to a camera overfit its photo. Park et al. ("DropGaussian", CVPR 2025) drop a
-random, growing fraction of all Gaussians in each step and scale up the opacities of the others. Here groups of
+Park et al. ("DropGaussian", CVPR 2025) drop a random fraction of all Gaussians in each step when there are few
+photos, and scale up the opacities of the others. In a collection of any size some surfaces are shown by few photos
+only, so the rate of each Gaussian depends on how many photos show it (`wildgs.engine.photo_counts`). Groups of
 neighbouring Gaussians are dropped, because neighbours would compensate for a single one. Training keeps Gaussians
 in Morton order, so that consecutive rows are neighbours.
 """
@@ -12,17 +13,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wildgs.model.config import DropoutConfig
 
-def opacity_factors(count: int, rate: float, neighbours: int, device: torch.device) -> Float[Tensor, " N"]:
-    """Factors on opacities in one step: 0 for dropped Gaussians, above 1 for the others.
+FULL_RATE = 0.25
+"""Fraction of `DropoutConfig.photos` up to which the dropout rate is at its maximum."""
+
+
+def dropout_rates(config: DropoutConfig, photos: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """Dropout rate of each Gaussian.
 
     Args:
-        count: Number of Gaussians, N.
-        rate: Dropout rate.
-        neighbours: Number of consecutive Gaussians that are dropped together.
-        device: Device of the factors.
+        config: The maximum, and the number of photos from which nothing is dropped.
+        photos: Effective number of photos that show each Gaussian.
     """
-    runs = -(-count // neighbours)
-    kept = (torch.rand(runs, device=device) >= rate).to(torch.float32) / (1.0 - rate)
+    share = (1 - photos / config.photos) / (1 - FULL_RATE) if config.photos else torch.zeros_like(photos)
+    return config.rate * share.clamp(0, 1)
+
+
+def opacity_factors(rates: Float[Tensor, "N"], neighbours: int) -> Float[Tensor, "N"]:
+    """Factors on opacities in one step: 0 for dropped Gaussians, 1 / (1 - rate) for the others.
+
+    Args:
+        rates: Dropout rates.
+        neighbours: Number of consecutive Gaussians that share a random number.
+    """
+    count = len(rates)
+    drawn = torch.rand(-(-count // neighbours), device=rates.device)
     shift = int(torch.randint(neighbours, ()))  # varies the groups
-    return kept.repeat_interleave(neighbours).roll(shift)[:count]
+    drawn = drawn.repeat_interleave(neighbours).roll(shift)[:count]
+    return torch.where(drawn < rates, 0.0, 1.0 / (1.0 - rates))

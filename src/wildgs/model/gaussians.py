@@ -37,6 +37,8 @@ class Gaussians(nn.Module):
 
     Attributes:
         rows: All parameters.
+        photos: Effective number of training photos that show each Gaussian, edited together with `rows`; None until
+            they are counted (`wildgs.engine.photo_counts`).
         eps2d: Added to the diagonal of 2D covariances; see `wildgs.rasterize.project`.
         antialiased: Whether opacities compensate for it; see `wildgs.rasterize.project`.
     """
@@ -45,6 +47,7 @@ class Gaussians(nn.Module):
         """Creates the parameters from initial values, which include `GEOMETRY_ROWS`."""
         super().__init__()
         self.eps2d, self.antialiased = EPS2D, False
+        self.photos: Float[Tensor, "N"] | None = None
         self.rows = nn.ParameterDict({name: nn.Parameter(value) for name, value in rows.items()})
 
     def __len__(self) -> int:

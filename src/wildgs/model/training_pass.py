@@ -22,7 +22,7 @@ class Stage:
         sh_degree: Active degree of the spherical harmonics.
         learn_encoder: Whether the image encoder gets gradients.
         learn_planes: Whether the triplane's UNet gets gradients.
-        dropout: Dropout rate of Gaussians (see `wildgs.model.dropout`).
+        dropout: Dropout rates of the Gaussians (see `wildgs.model.dropout`); None if none is dropped.
         neighbours: Number of neighbouring Gaussians that are dropped together.
         absgrad: Whether absolute view-space gradients are collected.
     """
@@ -32,7 +32,7 @@ class Stage:
     sh_degree: int = 3
     learn_encoder: bool = True
     learn_planes: bool = True
-    dropout: float = 0.0
+    dropout: Float[Tensor, "N"] | None = None
     neighbours: int = 8
     absgrad: bool = False
 

@@ -46,6 +46,7 @@ class WildGS(Method):
     memory: ClassVar[MemoryUse] = MemoryUse(per_gaussian=6000, per_pixel=700, fixed=600 * 2**20)
     reset_every: ClassVar[int] = 0
     density: ClassVar[str] = "relocation"
+    uses_dropout = True
     config: WildGSConfig
 
     def __init__(
@@ -347,9 +348,7 @@ class WildGS(Method):
         appearance = self.parse(
             photo, learn_encoder=stage.learn_encoder, learn_mask=stage.learn_mask, name=name
         )
-        factors = None
-        if stage.dropout > 0:
-            factors = opacity_factors(self.num_gaussians, stage.dropout, stage.neighbours, photo.device)
+        factors = None if stage.dropout is None else opacity_factors(stage.dropout, stage.neighbours)
         projection = self.gaussians.project(camera, absgrad=stage.absgrad, factors=factors)
         projection.means2d.retain_grad()
         if stage.explicit and self._wraps:

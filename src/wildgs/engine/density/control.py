@@ -197,7 +197,7 @@ class DensityControl(ABC):
             return 0
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         keep[gaussians.opacities.argsort(stable=True)[:excess]] = False
-        edit_rows(gaussians, optimizer, keep, {name: rows[:0] for name, rows in gaussians.rows.items()})
+        edit_rows(gaussians, optimizer, keep, self._taken(gaussians, keep.new_zeros(0, dtype=torch.int64)))
         gathered = {name: value[keep] for name, value in self.state().items()}
         self.restore(gathered)
         return excess
@@ -233,8 +233,10 @@ class DensityControl(ABC):
 
     @staticmethod
     def _taken(gaussians: Gaussians, which: Int[Tensor, " C"], times: int = 1) -> dict[str, Tensor]:
-        """Copies the parameters of selected Gaussians, `times` times."""
+        """Copies the parameters of selected Gaussians, and the photos that show them, `times` times."""
+        values = dict(gaussians.rows.items())
+        if gaussians.photos is not None:
+            values["photos"] = gaussians.photos
         return {
-            name: rows.detach()[which].repeat(times, *[1] * (rows.dim() - 1))
-            for name, rows in gaussians.rows.items()
+            name: rows.detach()[which].repeat(times, *[1] * (rows.dim() - 1)) for name, rows in values.items()
         }
