@@ -22,6 +22,7 @@ from PIL import Image
 from torch import Tensor
 
 import wildgs
+from wildgs.engine.photo_counts import blending_weights
 from wildgs.geometry.camera import Camera
 from wildgs.model.gaussians import Gaussians
 from wildgs.rasterize import blend
@@ -35,10 +36,9 @@ def number_of_views(gaussians: Gaussians, cameras: Iterable[Camera]) -> Float[Te
     """Effective number of views of each Gaussian."""
     total, squares = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
     for camera in cameras:
-        colors = torch.ones(len(gaussians), 3, requires_grad=True)
-        (weight,) = torch.autograd.grad(blend(gaussians.project(camera), colors).colors[..., 0].sum(), colors)
-        total += weight[:, 0]
-        squares += weight[:, 0].square()
+        weights = blending_weights(gaussians, camera)
+        total += weights
+        squares += weights.square()
     return torch.where(total < LEAST_WEIGHT, 0.0, total.square() / squares.clamp_min(1e-9))
 
 
@@ -54,8 +54,7 @@ def by_views(run: Path, scene: Path) -> list[tuple[float, float]]:
     """Share of pixels and contribution to the mean squared error for each interval of `LIMITS`."""
     loaded = wildgs.load(run)
     gaussians, photos = loaded.gaussians, loaded.scene
-    with torch.enable_grad():
-        seen = number_of_views(gaussians, (view.camera for view in photos.train_views))
+    seen = number_of_views(gaussians, (view.camera for view in photos.train_views))
     columns: list[list[tuple[float, float]]] = [[] for _ in LIMITS[1:]]
     for view in photos.test_views:
         render = run / "eval" / "full" / f"{Path(view.name).stem}.png"

@@ -49,7 +49,9 @@ def count_photos(gaussians: Gaussians, feed: PhotoFeed) -> Float[Tensor, "N"]:
     total = gaussians.means.new_zeros(len(gaussians))
     squares = torch.zeros_like(total)
     for view in chosen[feed.team.rank :: feed.team.size]:
-        weights = blending_weights(gaussians, feed.camera(view))
+        camera = feed.camera(view)
+        width, height = (max(1, round(SIDE * side)) for side in (camera.width, camera.height))
+        weights = blending_weights(gaussians, camera.resized(width, height))
         total += weights
         squares += weights.square()
     pooled = feed.team.pool(ViewStatistics(total, squares, torch.zeros_like(total)))
@@ -58,10 +60,9 @@ def count_photos(gaussians: Gaussians, feed: PhotoFeed) -> Float[Tensor, "N"]:
 
 
 def blending_weights(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "N"]:
-    """Sum over pixels of each Gaussian's blending weight, at `SIDE` of the camera's size."""
-    width, height = (max(1, round(SIDE * side)) for side in (camera.width, camera.height))
+    """Sum over pixels of each Gaussian's blending weight."""
     with torch.no_grad():
-        projection = gaussians.project(camera.resized(width, height))
+        projection = gaussians.project(camera)
     colors = gaussians.means.new_ones(len(gaussians), 3).requires_grad_()
     with torch.enable_grad():
         blended = blend(projection, colors).colors[..., 0].sum()
