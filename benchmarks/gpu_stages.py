@@ -27,7 +27,8 @@ from typing import Any
 import torch
 
 from train_step import make_scene, make_trainer
-from wildgs.engine.trainer import StepReport, Trainer
+from wildgs.engine.report import StepReport
+from wildgs.engine.trainer import Trainer
 from wildgs.errors import WildGSWarning
 from wildgs.features import FEATURES
 from wildgs.model.wildgs import WildGSConfig

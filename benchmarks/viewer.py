@@ -18,7 +18,8 @@ from pathlib import Path
 
 import tyro
 
-from wildgs.engine.trainer import StepReport, Trainer
+from wildgs.engine.report import StepReport
+from wildgs.engine.trainer import Trainer
 from wildgs.runs import load_run, resume_training
 from wildgs.viewer.jobs import TrainingTurns
 from wildgs.viewer.serving import ServerConfig, open_server

@@ -25,7 +25,7 @@ def frozen_model(tiny_model: WildGSConfig) -> WildGSConfig:
 
 
 def with_doubt(largest: float) -> Consensus:
-    consensus = Consensus(torch.device("cpu"))
+    consensus = Consensus(torch.device("cpu"), 1000)
     consensus.doubts = {"a": torch.tensor([[0.0, 0.25, 1.0]])}
     consensus.largest = largest
     return consensus
@@ -88,13 +88,15 @@ def test_consensus_counts_once_masks_have_hidden_too_much() -> None:
 
 
 def test_the_share_of_hidden_pixels_is_remembered_at_its_maximum() -> None:
-    consensus = Consensus(torch.device("cpu"))
+    consensus = Consensus(torch.device("cpu"), 1000)
     for _ in range(200):
-        consensus.observe(torch.tensor([[0.2, 0.9], [0.9, 0.9]]))
+        consensus.observe(torch.tensor([[0.2, 0.9], [0.9, 0.9]]), 0)
     assert consensus.hidden.tolist() == pytest.approx([0.25, 0.25], abs=0.01)
     for _ in range(200):
-        consensus.observe(torch.ones(2, 2))
+        consensus.observe(torch.ones(2, 2), 0)
     assert consensus.hidden.tolist() == pytest.approx([0.0, 0.25], abs=0.01)
+    consensus.observe(torch.zeros(2, 2), 1000)
+    assert float(consensus.hidden[0]) < 0.01, "observed a mask that is not trained any more"
 
 
 def test_doubt_is_a_factor_on_the_evidence() -> None:
@@ -145,4 +147,4 @@ def test_checkpoints_of_earlier_versions_have_hidden_nothing(
     hide_everything(trainer)
     trainer.restore(earlier)
     assert trainer.consensus.hidden.tolist() == [0, 0]
-    assert not trainer.consensus.missing
+    assert not trainer.consensus.is_missing(0, 1)

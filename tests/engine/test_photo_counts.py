@@ -13,8 +13,9 @@ from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_che
 from wildgs.engine.config import DensityConfig, Strategy
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.photo_counts import count_interval, count_photos, is_due
+from wildgs.engine.report import StepReport
 from wildgs.engine.team import Team
-from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
+from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.config import DropoutConfig
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.registry import MethodName, create_method, restore_method

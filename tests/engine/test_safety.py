@@ -13,8 +13,9 @@ import torch
 from tests.memory_views import GonePhotos
 from wildgs.engine.autosave import Autosave
 from wildgs.engine.checkpoint import Checkpoint
+from wildgs.engine.report import StepReport
 from wildgs.engine.safety import PATIENCE, TrainingDivergedError
-from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
+from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.registry import create_method, restore_method
 from wildgs.model.vanilla import VanillaConfig

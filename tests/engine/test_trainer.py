@@ -17,8 +17,9 @@ from wildgs.engine.density import SeenView
 from wildgs.engine.density.control import ViewStatistics
 from wildgs.engine.density.relocation import RelocationDensity
 from wildgs.engine.recorder import Recorder
+from wildgs.engine.report import StepReport
 from wildgs.engine.schedule import ScheduleConfig
-from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
+from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.model.config import SQUEEZENET
 from wildgs.model.registry import MethodName, create_method, restore_method

@@ -20,9 +20,10 @@ from wildgs.engine.checkpoint import Checkpoint
 from wildgs.engine.config import DensityConfig
 from wildgs.engine.density import SeenView
 from wildgs.engine.distributed import join
+from wildgs.engine.report import StepReport
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.team import Team
-from wildgs.engine.trainer import StepReport, TrainConfig, Trainer
+from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses
 from wildgs.model.registry import MethodName, create_method

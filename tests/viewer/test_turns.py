@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from wildgs.engine.trainer import StepReport
+from wildgs.engine.report import StepReport
 from wildgs.viewer.jobs import SHARE, Jobs, TrainingTurns
 
 REPORT = StepReport.__new__(StepReport)

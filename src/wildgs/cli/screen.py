@@ -24,7 +24,7 @@ from rich.table import Table
 from wildgs import processes
 
 if TYPE_CHECKING:
-    from wildgs.engine.trainer import StepReport
+    from wildgs.engine.report import StepReport
     from wildgs.library.evaluation import Scores
     from wildgs.library.pipeline import FinishedRun
     from wildgs.light.look import Look

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from wildgs.engine.checkpoint import save_checkpoint
-from wildgs.engine.trainer import StepReport
+from wildgs.engine.report import StepReport
 from wildgs.errors import UserError, WildGSWarning
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.engine.feed import PhotoFeed
+from wildgs.engine.schedule import falls_on
 from wildgs.model.method import Method
 from wildgs.priors.consensus import (
     NEIGHBOURS,
@@ -42,24 +43,30 @@ class Consensus:
     Attributes:
         doubts: Degree to which each photo may be transient, in cells, by its name; see `priors.consensus.doubts`.
         hidden: Running share of hidden pixels, and its maximum so far.
-        largest: The maximum as of the last `check`.
+        largest: The maximum when it was last read.
         compared: Whether the photos have been compared.
     """
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, steps: int) -> None:
+        """Starts with masks that have hidden nothing.
+
+        Args:
+            device: Device on which the share of hidden pixels is kept, so that nothing waits for it.
+            steps: Number of steps in which masks are trained by evidence, and are watched.
+        """
+        self.steps = steps
         self.doubts: dict[str, Float[Tensor, "_ _"]] = {}
         self.hidden = torch.zeros(2, device=device)
         self.largest = 0.0
         self.compared = False
 
-    @property
-    def missing(self) -> bool:
-        """Whether the photos have to be compared now."""
+    def is_missing(self, step: int, taken: int) -> bool:
+        """Whether the photos have to be compared before the step after `step`, which counts as `taken` steps."""
+        if step >= self.steps:
+            return False
+        if falls_on(step, taken, CHECK_EVERY):
+            self.largest = float(self.hidden[1])
         return self.largest > USUAL and not self.compared
-
-    def check(self) -> None:
-        """Reads how much masks have hidden."""
-        self.largest = float(self.hidden[1])
 
     def state(self) -> Float[Tensor, " 3"]:
         """What `restore` needs to continue in the same way."""
@@ -105,8 +112,10 @@ class Consensus:
         self.doubts = dict(zip(found, doubts(list(found.values())), strict=True))
 
     @torch.no_grad()
-    def observe(self, visibility: Float[Tensor, "H W"]) -> None:
-        """Takes account of the mask of one more photo, without synchronisation."""
+    def observe(self, visibility: Float[Tensor, "H W"], step: int) -> None:
+        """Takes account of the mask of the photo of a step, without synchronisation."""
+        if step >= self.steps:
+            return
         share = torch.lerp((visibility < 0.5).float().mean(), self.hidden[0], MEMORY)
         self.hidden = torch.stack([share, torch.maximum(share, self.hidden[1])])
 

@@ -1,4 +1,4 @@
-"""Counts how many training photos show each Gaussian, for dropout."""
+"""Counts how many training photos show each Gaussian, for dropout (`wildgs.model.dropout`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from wildgs.engine.density import ViewStatistics
 from wildgs.engine.feed import PhotoFeed
 from wildgs.engine.schedule import falls_on
 from wildgs.geometry.camera import Camera
+from wildgs.model.config import DropoutConfig
+from wildgs.model.dropout import dropout_rates
 from wildgs.model.gaussians import Gaussians
+from wildgs.model.method import Method
 from wildgs.rasterize import blend
 
 LEAST_INTERVAL, COUNTS = 250, 12
@@ -19,6 +22,41 @@ MOST_VIEWS = 100
 """Number of photos, evenly distributed over the collection, that are counted; the result is extrapolated."""
 SIDE = 0.5
 """Size at which Gaussians are projected, relative to the photos."""
+
+
+class PhotoCounts:
+    """Keeps the numbers of photos that show each Gaussian up to date in training, and derives dropout rates."""
+
+    def __init__(self, method: Method, config: DropoutConfig, steps: int) -> None:
+        """Starts without numbers, hence without dropout.
+
+        Args:
+            method: The method; the numbers are kept as `Gaussians.photos`, which density control edits.
+            config: Options of dropout.
+            steps: Number of steps of the run.
+        """
+        self._method, self._config, self._steps = method, config, steps
+        self._used = method.uses_dropout and config.rate > 0
+
+    def update(self, step: int, feed: PhotoFeed) -> None:
+        """Counts before the step after `step`, if it is time."""
+        if self._used and is_due(step, feed.team.size, self._steps):
+            self._method.gaussians.photos = count_photos(self._method.gaussians, feed)
+
+    def dropout_rates(self) -> Float[Tensor, "N"] | None:
+        """Probability of each Gaussian to be dropped; None without dropout, and before the first count."""
+        photos = self._method.gaussians.photos
+        return dropout_rates(self._config, photos) if self._used and photos is not None else None
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs to continue in the same way."""
+        photos = self._method.gaussians.photos
+        return {} if photos is None else {"photos": photos}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continues from `state`."""
+        photos, gaussians = state.get("photos"), self._method.gaussians
+        gaussians.photos = None if photos is None else photos.to(gaussians.means.device)
 
 
 def count_interval(steps: int) -> int:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from wildgs.engine.trainer import StepReport
+from wildgs.engine.report import StepReport
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import check_regular, is_there, printable, written_aside
 

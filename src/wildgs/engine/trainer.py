@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import reduce
 
 import torch
@@ -14,18 +14,18 @@ from torch import Tensor
 
 from wildgs import features
 from wildgs.engine.config import TrainConfig
-from wildgs.engine.consensus import CHECK_EVERY, Consensus
+from wildgs.engine.consensus import Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.optimizers import Optimizers, sort_rows
-from wildgs.engine.photo_counts import count_photos, is_due
+from wildgs.engine.photo_counts import PhotoCounts
 from wildgs.engine.process_settings import ProcessSettings
+from wildgs.engine.report import Observer, StepReport
 from wildgs.engine.safety import StepGuard
-from wildgs.engine.schedule import Schedule, falls_on
+from wildgs.engine.schedule import Schedule
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses, total_loss
-from wildgs.model.dropout import dropout_rates
 from wildgs.model.method import Method
 from wildgs.model.parsing import FeatureCache, keep_features
 from wildgs.model.precision import (
@@ -36,7 +36,6 @@ from wildgs.model.precision import (
 )
 from wildgs.model.training_pass import SeenPhoto, TrainingOutput
 from wildgs.progress import Counter
-from wildgs.rasterize import Rendering
 from wildgs.scene import Scene, View, scene_extent
 from wildgs.scene.scene import observed_pixels
 
@@ -44,52 +43,12 @@ PREPARATION_PHOTOS = 16
 FEATURE_CACHE_BYTES = 10**9
 
 
-@dataclass(frozen=True)
-class StepReport:
-    """The result of a step, for observers.
-
-    All tensors are detached from the autograd graph. A graph that outlives the step would keep its tile lists in
-    memory, and its gradient accumulators, which are bound to the default stream, would invalidate the capture of a
-    CUDA graph.
-
-    Attributes:
-        step: Number of steps done, from 1.
-        view: The photo of the step.
-        losses: All loss terms, as tensors, so that only reading them synchronises with the device.
-        rendering: The render of the photo.
-        visibility: The mask M; None for a method without one.
-        num_gaussians: Number of Gaussians after the step.
-        density: Result of densification, if it ran.
-        skipped: Why the step (on a GPU: the previous step) was skipped for a non-finite loss or gradient, if it
-            was.
-        taken: Number of steps that this one counts as: photos of all processes.
-        seconds: Training time so far, without that of observers.
-    """
-
-    step: int
-    view: View
-    losses: Losses
-    rendering: Rendering
-    visibility: Float[Tensor, "H W"] | None
-    num_gaussians: int
-    density: DensityReport | None
-    seconds: float
-    skipped: str | None = None
-    taken: int = 1
-
-    def falls_on(self, every: int) -> bool:
-        """Whether this step reaches or passes a multiple of `every`."""
-        return falls_on(self.step, self.taken, every)
-
-
-Observer = Callable[[StepReport], None]
-
-
 class Trainer:
     """Trains a method on a scene's training photos.
 
     Attributes:
         consensus: What may be transient in the training photos, as far as they have been compared.
+        photo_counts: How many photos show each Gaussian, and hence how often it is dropped.
         on_compared_photo: Called with (photos done, total number of photos) when the photos are compared.
         on_final_photo: Called with (photos done, total number of photos) during `Method.finish` after the last
             step.
@@ -140,7 +99,10 @@ class Trainer:
         self.feed = PhotoFeed(
             self.views, self.sampler, self.team, self.device, observed_pixels(scene), scene.points
         )
-        self.consensus = Consensus(self.device)
+        objective = config.objective
+        evident = objective.consensus and objective.mask_gradient == "evidence"
+        self.consensus = Consensus(self.device, self.schedule.mask_steps if evident else 0)
+        self.photo_counts = PhotoCounts(method, config.dropout, config.steps)
         self.guard = StepGuard()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
@@ -194,8 +156,9 @@ class Trainer:
     def advance(self) -> StepReport:
         """Takes one step with one photo per rank."""
         start = time.perf_counter()
-        self._watch_masks()
-        self._count_photos()
+        if self.consensus.is_missing(self.step, self.team.size):
+            self.consensus.compare(self.method, self._scene, self.feed, self.on_compared_photo)
+        self.photo_counts.update(self.step, self.feed)
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
@@ -292,9 +255,8 @@ class Trainer:
         sky: Bool[Tensor, "H W"] | None,
     ) -> tuple[TrainingOutput, Losses]:
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
-        dropout, photos = self.config.dropout, self.method.gaussians.photos
-        rates = dropout_rates(dropout, photos) if self._drops and photos is not None else None
-        stage = replace(stage, dropout=rates, neighbours=dropout.neighbours, absgrad=self.density.absgrad)
+        rates, neighbours = self.photo_counts.dropout_rates(), self.config.dropout.neighbours
+        stage = replace(stage, dropout=rates, neighbours=neighbours, absgrad=self.density.absgrad)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = total_loss(
@@ -316,8 +278,8 @@ class Trainer:
             num_photos=len(self.views),
             doubt=self.consensus.doubt(view.name),
         )
-        if output.visibility is not None and self._watches_masks:
-            self.consensus.observe(output.visibility)
+        if output.visibility is not None:
+            self.consensus.observe(output.visibility, self.step)
         return output, losses
 
     def _control_density(self, taken: int) -> DensityReport | None:
@@ -354,32 +316,6 @@ class Trainer:
         chosen = [view for view in self.views[::stride][:PREPARATION_PHOTOS] if self.feed.is_readable(view)]
         self.method.prepare([self.feed.photo(view)[0] for view in chosen])
 
-    @property
-    def _watches_masks(self) -> bool:
-        """Whether masks are trained by evidence in this part of the run."""
-        objective = self.config.objective
-        evident = objective.consensus and objective.mask_gradient == "evidence"
-        return evident and self.step < self.schedule.mask_steps
-
-    def _watch_masks(self) -> None:
-        """Compares the photos if masks have hidden too much."""
-        if not self._watches_masks:
-            return
-        if falls_on(self.step, self.team.size, CHECK_EVERY):
-            self.consensus.check()
-        if self.consensus.missing:
-            self.consensus.compare(self.method, self._scene, self.feed, self.on_compared_photo)
-
-    @property
-    def _drops(self) -> bool:
-        """Whether Gaussians that few photos show are dropped at random."""
-        return self.method.uses_dropout and self.config.dropout.rate > 0
-
-    def _count_photos(self) -> None:
-        """Counts the photos that show each Gaussian, if it is time."""
-        if self._drops and is_due(self.step, self.team.size, self.config.steps):
-            self.method.gaussians.photos = count_photos(self.method.gaussians, self.feed)
-
     def _finish(self) -> None:
         """Calls `Method.finish` with some training photos."""
         start = time.perf_counter()
@@ -408,8 +344,7 @@ class Trainer:
         state["progress.seconds"] = torch.tensor(self.seconds, dtype=torch.float64)
         state["progress.skipped"] = torch.tensor(self.guard.skipped)
         state["progress.hidden"] = self.consensus.state()
-        if self.method.gaussians.photos is not None:
-            state["dropout.photos"] = self.method.gaussians.photos
+        state |= {f"dropout.{name}": value for name, value in self.photo_counts.state().items()}
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -427,8 +362,7 @@ class Trainer:
         self.seconds = float(state["progress.seconds"])
         self.guard.skipped = int(state.get("progress.skipped", 0))
         self.consensus.restore(state.get("progress.hidden", torch.zeros(3)))
-        photos = state.get("dropout.photos")
-        self.method.gaussians.photos = None if photos is None else photos.to(self.device)
+        self.photo_counts.restore(_under(state, "dropout."))
         if self.step < self.config.steps:
             self.method.finish(())
 

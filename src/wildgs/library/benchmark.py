@@ -14,7 +14,7 @@ from wildgs import processes
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.checkpoint import list_checkpoints
 from wildgs.engine.distributed import assign_device
-from wildgs.engine.trainer import Observer
+from wildgs.engine.report import Observer
 from wildgs.errors import UserError
 from wildgs.evaluation.benchmark import Row, Score, summarize
 from wildgs.evaluation.benchmark_table import LABELS as PUBLISHED_LABELS

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
+from wildgs.engine.report import StepReport
 from wildgs.engine.team import Team
-from wildgs.engine.trainer import StepReport
 from wildgs.errors import UserError
 from wildgs.files import check_regular, is_there
 

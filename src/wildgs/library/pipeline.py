@@ -9,7 +9,7 @@ from typing import Literal
 
 from wildgs.config import CONFIG_FILE, ExecutionConfig, RunConfig, read_config, with_entries
 from wildgs.engine.config import DensityConfig, TrainConfig
-from wildgs.engine.trainer import Observer
+from wildgs.engine.report import Observer
 from wildgs.errors import UserError
 from wildgs.library.collection import (
     changed_options,

@@ -18,7 +18,7 @@ from wildgs.rasterize.cpu.warm_up import compile_blending, compile_gradients
 from wildgs.threads import limited
 
 if TYPE_CHECKING:
-    from wildgs.engine.trainer import StepReport
+    from wildgs.engine.report import StepReport
 
 
 def main(config: str, folder: str, threads: str) -> None:

@@ -18,8 +18,9 @@ from wildgs.config import BUDGET, CONFIG_FILE, ExecutionConfig, RunConfig, diffe
 from wildgs.engine.autosave import Autosave, CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
+from wildgs.engine.report import Observer, StepReport
 from wildgs.engine.team import Team
-from wildgs.engine.trainer import Observer, StepReport, Trainer
+from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.photos import PhotoFit, describe_misfits, inspect_photos, write_photos
 from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, run_log

@@ -7,7 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
-from wildgs.engine.trainer import StepReport
+from wildgs.engine.report import StepReport
 
 Job = Callable[[], None]
 

@@ -16,7 +16,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from wildgs.engine.trainer import Observer, StepReport, Trainer
+from wildgs.engine.report import Observer, StepReport
+from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError
 from wildgs.files import printable
 from wildgs.library.day import known_day
