@@ -22,6 +22,7 @@ import numpy as np
 import wildgs
 from wildgs.scene.colmap import read_model
 from wildgs.scene.demo import write_demo_scene
+from wildgs.sfm.config import PairingConfig, SfmConfig
 
 
 def poses_of(scene: Path) -> dict[str, np.ndarray]:
@@ -55,6 +56,9 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="take every n-th photo")
     parser.add_argument("--mix", type=Path, help="scene of another place whose photos are mixed in")
     parser.add_argument("--mixed", type=int, default=30)
+    usual = PairingConfig()
+    parser.add_argument("--exhaustive-limit", type=int, default=usual.exhaustive_limit)
+    parser.add_argument("--neighbours", type=int, default=usual.neighbours)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -70,7 +74,8 @@ def main() -> None:
             for file in sorted((arguments.mix / "images").iterdir())[: arguments.mixed]:
                 shutil.copy(file, root / "photos" / f"mixed_{file.name}")
         started, used = time.perf_counter(), time.process_time()
-        report = wildgs.reconstruct(root / "photos", root / "out")
+        pairing = PairingConfig(arguments.exhaustive_limit, arguments.neighbours)
+        report = wildgs.reconstruct(root / "photos", root / "out", SfmConfig(pairing=pairing))
         found = poses_of(root / "out")
         strangers = sum(name.startswith("mixed_") for name in found)
         errors = []
@@ -84,7 +89,8 @@ def main() -> None:
         print(
             f"{arguments.scene} every {arguments.every}: {len(found) - strangers} of {len(files)} registered,"
             f" {strangers} strangers, AUC@5 {auc(scores, 5):.3f}, AUC@10 {auc(scores, 10):.3f},"
-            f" {report.pairs} pairs, other places {[len(group) for group in report.other_places]},"
+            f" {report.points} points, {report.pairs} pairs,"
+            f" other places {[len(group) for group in report.other_places]},"
             f" {time.perf_counter() - started:.0f} s"
             f" ({time.process_time() - used:.0f} s of CPU)"
         )

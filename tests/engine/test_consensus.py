@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.engine.test_trainer import trainer_for
-from wildgs.engine.consensus import SUSPICIOUS, USUAL, Consensus
+from wildgs.engine.consensus import RISE, USUAL_FEW, USUAL_MANY, Consensus, usual_share
 from wildgs.engine.trainer import Trainer
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.losses.photometric import masked_photometric
@@ -25,7 +25,7 @@ def frozen_model(tiny_model: WildGSConfig) -> WildGSConfig:
 
 
 def with_doubt(largest: float) -> Consensus:
-    consensus = Consensus(torch.device("cpu"), 1000)
+    consensus = Consensus(torch.device("cpu"), 10, 1000)
     consensus.doubts = {"a": torch.tensor([[0.0, 0.25, 1.0]])}
     consensus.largest = largest
     return consensus
@@ -76,8 +76,8 @@ def test_methods_without_a_frozen_encoder_have_no_features_to_compare(
 
 
 def test_consensus_counts_once_masks_have_hidden_too_much() -> None:
-    full, none = with_doubt(SUSPICIOUS).doubt("a"), with_doubt(USUAL).doubt("a")
-    half = with_doubt((USUAL + SUSPICIOUS) / 2).doubt("a")
+    full, none = with_doubt(USUAL_FEW + RISE).doubt("a"), with_doubt(USUAL_FEW).doubt("a")
+    half = with_doubt(USUAL_FEW + RISE / 2).doubt("a")
     assert full is not None
     assert none is not None
     assert half is not None
@@ -87,8 +87,18 @@ def test_consensus_counts_once_masks_have_hidden_too_much() -> None:
     assert with_doubt(1.0).doubt("b") is None
 
 
+def test_masks_of_many_photos_are_trusted_less() -> None:
+    assert usual_share(1) == usual_share(20) == USUAL_FEW
+    assert usual_share(60) == usual_share(3000) == pytest.approx(USUAL_MANY)
+    shares = [usual_share(photos) for photos in range(20, 61)]
+    assert shares == sorted(shares, reverse=True)
+    consensus = Consensus(torch.device("cpu"), 90, 1000)
+    consensus.hidden = torch.tensor([0.0, USUAL_FEW])
+    assert consensus.is_missing(0, 1)
+
+
 def test_the_share_of_hidden_pixels_is_remembered_at_its_maximum() -> None:
-    consensus = Consensus(torch.device("cpu"), 1000)
+    consensus = Consensus(torch.device("cpu"), 10, 1000)
     for _ in range(200):
         consensus.observe(torch.tensor([[0.2, 0.9], [0.9, 0.9]]), 0)
     assert consensus.hidden.tolist() == pytest.approx([0.25, 0.25], abs=0.01)
@@ -119,7 +129,7 @@ def test_a_resumed_run_compares_where_the_first_one_did(
     wall_scene: Scene, frozen_model: WildGSConfig
 ) -> None:
     first = trainer_for(wall_scene, frozen_model, 4)
-    hide_everything(first, (USUAL + SUSPICIOUS) / 2)
+    hide_everything(first, USUAL_FEW + RISE / 2)
     first.begin()
     first.advance()
     second = trainer_for(wall_scene, frozen_model, 4)

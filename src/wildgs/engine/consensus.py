@@ -23,9 +23,14 @@ from wildgs.scene import Scene, View
 
 BASIS_PHOTOS = 64
 """Number of photos from which principal components are computed."""
-USUAL, SUSPICIOUS = 0.18, 0.22
-"""Shares of hidden pixels up to which masks are trusted, and from which on consensus counts fully. Passers-by and
-coaches cover a tenth of the photos of a crowded square; masks hide up to 16% of them at first if photos are few."""
+USUAL_FEW, USUAL_MANY = 0.18, 0.10
+"""Share of hidden pixels up to which masks are trusted, with few photos and with many. Passers-by and coaches cover
+a tenth of the photos of a crowded square. With few photos masks hide up to 16% at first, and consensus is less
+reliable."""
+FEW, MANY = 20, 60
+"""Numbers of photos that count as few and as many; in between, the share is interpolated."""
+RISE = 0.04
+"""Further share of hidden pixels until consensus counts fully."""
 MEMORY = 0.98
 """Weight of earlier photos in the running share of hidden pixels."""
 CHECK_EVERY = 50
@@ -36,24 +41,28 @@ class Consensus:
     """What may be transient in the training photos, as far as masks need to be told.
 
     Masks are left alone while they hide no more than passers-by usually cover: where few photos are memorised,
-    passers-by have to be found early, and consensus, which is coarse, misses small ones. Masks that hide more than
-    that hide trees, façades or whole photos, and never show them again, because what is hidden is not learnt. From
-    then on, evidence counts only where consensus is low. Photos are not compared before that.
+    passers-by have to be found early, and consensus, which is coarse and needs many photos, misses small ones.
+    Masks that hide more than that hide trees, façades or whole photos, and never show them again, because what is
+    hidden is not learnt. From then on, evidence counts only where consensus is low. Photos are not compared before
+    that.
 
     Attributes:
+        usual: Share of hidden pixels up to which masks are trusted.
         doubts: Degree to which each photo may be transient, in cells, by its name; see `priors.consensus.doubts`.
         hidden: Running share of hidden pixels, and its maximum so far.
         largest: The maximum when it was last read.
         compared: Whether the photos have been compared.
     """
 
-    def __init__(self, device: torch.device, steps: int) -> None:
+    def __init__(self, device: torch.device, photos: int, steps: int) -> None:
         """Starts with masks that have hidden nothing.
 
         Args:
             device: Device on which the share of hidden pixels is kept, so that nothing waits for it.
+            photos: Number of training photos.
             steps: Number of steps in which masks are trained by evidence, and are watched.
         """
+        self.usual = usual_share(photos)
         self.steps = steps
         self.doubts: dict[str, Float[Tensor, "_ _"]] = {}
         self.hidden = torch.zeros(2, device=device)
@@ -66,7 +75,7 @@ class Consensus:
             return False
         if falls_on(step, taken, CHECK_EVERY):
             self.largest = float(self.hidden[1])
-        return self.largest > USUAL and not self.compared
+        return self.largest > self.usual and not self.compared
 
     def state(self) -> Float[Tensor, " 3"]:
         """What `restore` needs to continue in the same way."""
@@ -125,8 +134,14 @@ class Consensus:
         found = self.doubts.get(name)
         if found is None:
             return None
-        strength = min(max((self.largest - USUAL) / (SUSPICIOUS - USUAL), 0.0), 1.0)
+        strength = min(max((self.largest - self.usual) / RISE, 0.0), 1.0)
         return 1 - strength * (1 - found)
+
+
+def usual_share(photos: int) -> float:
+    """Share of hidden pixels up to which masks are trusted, by the number of training photos."""
+    many = min(max((photos - FEW) / (MANY - FEW), 0.0), 1.0)
+    return USUAL_FEW + many * (USUAL_MANY - USUAL_FEW)
 
 
 def _features(method: Method, feed: PhotoFeed, view: View) -> Float[Tensor, "C h w"] | None:

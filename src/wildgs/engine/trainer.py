@@ -101,7 +101,7 @@ class Trainer:
         )
         objective = config.objective
         evident = objective.consensus and objective.mask_gradient == "evidence"
-        self.consensus = Consensus(self.device, self.schedule.mask_steps if evident else 0)
+        self.consensus = Consensus(self.device, len(self.views), self.schedule.mask_steps if evident else 0)
         self.photo_counts = PhotoCounts(method, config.dropout, config.steps)
         self.guard = StepGuard()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")

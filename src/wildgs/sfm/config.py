@@ -12,9 +12,9 @@ from wildgs.scene.config import MAX_IMAGE_PIXELS
 class PairingConfig:
     """Selection of image pairs to match."""
 
-    exhaustive_limit: int = 60
+    exhaustive_limit: int = 120
     """Match all pairs in sets of up to this many photos."""
-    neighbours: int = 16
+    neighbours: int = 32
     """Photos that each photo is matched with in larger sets."""
     gps_share: float = 0.8
     """Choose pairs by GPS position if at least this fraction of the photos has one."""
