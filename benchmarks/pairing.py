@@ -79,7 +79,7 @@ def _compare(scenes: list[Path], count: int) -> None:
         for file in files:
             (photos / f"{file.parents[1].name}_{file.name}").symlink_to(file.resolve())
         for name, limit in (("retrieval", 0), ("exhaustive", sys.maxsize)):
-            config = SfmConfig(pairing=PairingConfig(exhaustive_limit=limit))
+            config = SfmConfig(pairing=PairingConfig(exhaustive_features=limit))
             used, started = time.process_time(), time.perf_counter()
             report = wildgs.reconstruct(photos, Path(folder) / name, config)
             print(
@@ -130,7 +130,7 @@ def _measure_pairing(command: Command, count: int) -> dict[str, float]:
         extracted, before = time.process_time(), _peak()
         vlads = describe_photos(work, copies, config.seed)
         described = time.process_time()
-        chosen = choose_pairs(vlads, {}, config.pairing)
+        chosen = choose_pairs(vlads, {}, config.pairing, sys.maxsize)
         done = time.process_time()
         found = {photo for pair in chosen.pairs if sources[pair[0]] == sources[pair[1]] for photo in pair}
         return {

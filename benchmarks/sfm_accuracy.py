@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--mix", type=Path, help="scene of another place whose photos are mixed in")
     parser.add_argument("--mixed", type=int, default=30)
     usual = PairingConfig()
-    parser.add_argument("--exhaustive-limit", type=int, default=usual.exhaustive_limit)
+    parser.add_argument("--exhaustive-features", type=int, default=usual.exhaustive_features)
     parser.add_argument("--neighbours", type=int, default=usual.neighbours)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -74,7 +74,7 @@ def main() -> None:
             for file in sorted((arguments.mix / "images").iterdir())[: arguments.mixed]:
                 shutil.copy(file, root / "photos" / f"mixed_{file.name}")
         started, used = time.perf_counter(), time.process_time()
-        pairing = PairingConfig(arguments.exhaustive_limit, arguments.neighbours)
+        pairing = PairingConfig(arguments.exhaustive_features, arguments.neighbours)
         report = wildgs.reconstruct(root / "photos", root / "out", SfmConfig(pairing=pairing))
         found = poses_of(root / "out")
         strangers = sum(name.startswith("mixed_") for name in found)

@@ -24,8 +24,8 @@ def descriptors_of_places(photos: int, places: int) -> list[np.ndarray]:
     return result
 
 
-def test_small_sets_are_matched_all_with_all() -> None:
-    pairing = choose_pairs(torch.zeros(5, 128), {}, PairingConfig())
+def test_sets_of_few_features_are_matched_all_with_all() -> None:
+    pairing = choose_pairs(torch.zeros(5, 128), {}, PairingConfig(), 500_000)
     assert pairing == exhaustive_pairs(5)
     assert len(pairing.pairs) == 10
 
@@ -33,8 +33,8 @@ def test_small_sets_are_matched_all_with_all() -> None:
 def test_retrieval_finds_photos_of_the_same_place() -> None:
     photos, places = 60, 6
     features = descriptors_of_places(photos, places)
-    config = PairingConfig(exhaustive_limit=10, neighbours=9)
-    pairing = choose_pairs(vlad_descriptors(photos, features.__getitem__), {}, config)
+    config = PairingConfig(exhaustive_features=500, neighbours=9)
+    pairing = choose_pairs(vlad_descriptors(photos, features.__getitem__), {}, config, 501)
     assert pairing.name == "retrieval"
     assert np.mean([a % places == b % places for a, b in pairing.pairs]) > 0.95
     assert list(pairing.pairs) == sorted(set(pairing.pairs))
@@ -44,8 +44,10 @@ def test_retrieval_finds_photos_of_the_same_place() -> None:
 @pytest.mark.parametrize("photos", [40, 80])
 def test_pairs_grow_with_the_photos_not_with_their_square(photos: int) -> None:
     features = descriptors_of_places(photos, photos // 4)
-    config = PairingConfig(exhaustive_limit=10, neighbours=5)
-    assert len(choose_pairs(vlad_descriptors(photos, features.__getitem__), {}, config).pairs) <= 5 * photos
+    config = PairingConfig(exhaustive_features=500, neighbours=5)
+    assert (
+        len(choose_pairs(vlad_descriptors(photos, features.__getitem__), {}, config, 501).pairs) <= 5 * photos
+    )
 
 
 def test_photos_without_features_do_not_disturb() -> None:
@@ -70,18 +72,18 @@ def test_gps_neighbours_cross_the_date_line_and_keep_their_distance() -> None:
 def test_gps_counts_where_enough_photos_carry_it() -> None:
     photos = 30
     features = descriptors_of_places(photos, 3)
-    config = PairingConfig(exhaustive_limit=10, neighbours=4, gps_share=0.8)
+    config = PairingConfig(exhaustive_features=500, neighbours=4, gps_share=0.8)
     line = {photo: (45.0, 7.0 + 1e-4 * photo) for photo in range(photos)}
-    pairing = choose_pairs(vlad_descriptors(photos, features.__getitem__), line, config)
+    pairing = choose_pairs(vlad_descriptors(photos, features.__getitem__), line, config, 501)
     assert pairing.name == "gps"
     assert all((photo, photo + 1) in pairing.pairs for photo in range(photos - 1))
 
     mostly = {photo: place for photo, place in line.items() if photo != 13}
-    pairs = choose_pairs(vlad_descriptors(photos, features.__getitem__), mostly, config).pairs
+    pairs = choose_pairs(vlad_descriptors(photos, features.__getitem__), mostly, config, 501).pairs
     partners = [a + b - 13 for a, b in pairs if 13 in (a, b)]
     assert len(partners) >= 4  # the photo without a position is found by its looks
     few = {photo: line[photo] for photo in range(10)}
-    assert choose_pairs(vlad_descriptors(photos, features.__getitem__), few, config).name == "retrieval"
+    assert choose_pairs(vlad_descriptors(photos, features.__getitem__), few, config, 501).name == "retrieval"
 
 
 def test_friends_of_friends_are_those_with_the_strongest_links() -> None:

@@ -27,7 +27,7 @@ Corner = tuple[list[np.ndarray], list[np.ndarray]]
 # Affine shape finds more matches in photos as small as these.
 AFFINE = SfmConfig(affine_features=True)
 SMALL = SfmConfig(max_image_size=800)
-EAGER = SfmConfig(pairing=PairingConfig(exhaustive_limit=3, neighbours=3), affine_features=True)
+EAGER = SfmConfig(pairing=PairingConfig(exhaustive_features=0, neighbours=3), affine_features=True)
 
 
 def save_photos(folder: Path, photos: list[np.ndarray], **exif: Image.Exif) -> Path:
@@ -406,7 +406,7 @@ def test_all_of_sacre_coeur_registers(tmp_path: Path, shared: Path) -> None:
 
 @pytest.mark.shared
 def test_sacre_coeur_registers_by_retrieval(tmp_path: Path, shared: Path) -> None:
-    config = replace(SMALL, pairing=PairingConfig(exhaustive_limit=5, neighbours=6))
+    config = replace(SMALL, pairing=PairingConfig(exhaustive_features=0, neighbours=6))
     report = reconstruct(shared / "data/sacre_coeur/images", tmp_path / "scene", config)
     assert report.pairing == "retrieval"
     assert report.pairs < 45

@@ -12,10 +12,11 @@ from wildgs.scene.config import MAX_IMAGE_PIXELS
 class PairingConfig:
     """Selection of image pairs to match."""
 
-    exhaustive_limit: int = 120
-    """Match all pairs in sets of up to this many photos."""
+    exhaustive_features: int = 500_000
+    """Match all pairs in sets whose photos have up to this many features in total, on which the time depends: 60
+    large photos, or 250 of 2,000 features."""
     neighbours: int = 32
-    """Photos that each photo is matched with in larger sets."""
+    """Photos that each photo is matched with in sets of more features."""
     gps_share: float = 0.8
     """Choose pairs by GPS position if at least this fraction of the photos has one."""
     gps_distance: float = 200.0

@@ -129,7 +129,7 @@ def match(
         for photo, copy in enumerate(copies)
         if photo in rows and (position := copy.position) is not None
     }
-    chosen = choose_pairs(vlads[kept], positions, config.pairing)
+    chosen = choose_pairs(vlads[kept], positions, config.pairing, _count_features(work, copies, kept))
     pairs = {(kept[a], kept[b]) for a, b in chosen.pairs}
     match_pairs(
         work,
@@ -139,6 +139,13 @@ def match(
         lambda done, total: progress("matching pairs", done, total),
     )
     return Pairing(chosen.name, tuple(sorted(pairs | twins))), crops
+
+
+def _count_features(work: Workplace, copies: Sequence[WorkingCopy], photos: Collection[int]) -> int:
+    with closing(pycolmap.Database.open(work.database)) as database:
+        ids = image_ids(database, copies)
+        known = [image_id for photo in photos if (image_id := ids[photo]) is not None]
+        return sum(database.num_keypoints_for_image(image_id) for image_id in known)
 
 
 def match_pairs(

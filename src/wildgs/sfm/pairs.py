@@ -1,4 +1,4 @@
-"""Selection of image pairs: exhaustive for small sets, neighbours for large ones, and indirect neighbours.
+"""Selection of image pairs: exhaustive for sets of few features, else neighbours; and indirect neighbours.
 
 Neighbours are found by GPS position if enough photos have one, else by retrieval with VLAD descriptors (Jegou et
 al., "Aggregating local descriptors into a compact image representation", CVPR 2010) of SIFT features, for which no
@@ -166,9 +166,12 @@ def friends_of_friends(photos: Iterable[int], matched: Mapping[Pair, int], limit
 
 
 def choose_pairs(
-    vlads: Float[Tensor, "N D"], positions: Mapping[int, tuple[float, float]], config: PairingConfig
+    vlads: Float[Tensor, "N D"],
+    positions: Mapping[int, tuple[float, float]],
+    config: PairingConfig,
+    features: int,
 ) -> Pairing:
-    """Selects all pairs of a small set, or each photo's neighbours by GPS or retrieval of a large one.
+    """Selects all pairs of a set with few features, or each photo's neighbours by GPS or retrieval of a large one.
 
     With GPS, a quarter of the neighbours are still found by retrieval, because photos of the same building may be
     taken far apart; photos without GPS neighbours get all of them by retrieval.
@@ -177,9 +180,10 @@ def choose_pairs(
         vlads: VLAD descriptors of all photos.
         positions: Latitude and longitude in degrees of the photos that have them.
         config: Limits.
+        features: Total number of features of the photos.
     """
     count = len(vlads)
-    if count <= config.exhaustive_limit:
+    if features <= config.exhaustive_features:
         return exhaustive_pairs(count)
     near: set[Pair] = set()
     if len(positions) >= config.gps_share * count:
