@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,7 +39,10 @@ def test_mapping_is_repeated_while_photos_are_missing(
     copies = [WorkingCopy(f"{name}.jpg", name, f"{name}.jpg", False) for name in "abc"]
     seeds = []
 
-    def run(work: Workplace, count: int, config: SfmConfig, progress: object) -> list[FakeModel]:
+    def run(
+        work: Workplace, count: int, config: SfmConfig, progress: object, only: Sequence[str]
+    ) -> list[FakeModel]:
+        assert list(only) == []
         names = runs[len(seeds)]
         seeds.append(config.seed)
         return [FakeModel(names, 100 * len(names))] if names else []

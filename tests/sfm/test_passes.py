@@ -7,7 +7,7 @@ from wildgs.progress import silent
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
-from wildgs.sfm.passes import drop_unsure, place_with_plain_lens
+from wildgs.sfm.passes import drop_unsure, map_rest, place_with_plain_lens
 from wildgs.sfm.placement import NEIGHBOUR_POINTS, PassName, count_neighbours
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -58,3 +58,25 @@ def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:
     registered = {model.image(i).name for i in model.reg_image_ids()}
     assert lonely.name not in registered
     assert {first.name, late.name} <= registered, "photos of the first pass are kept"
+
+
+def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
+    work, copies = matched
+    main = map_photos(work, len(copies), SfmConfig(), silent)[0]
+    kept = {copies[0].work_name, copies[1].work_name}
+    for image_id in list(main.reg_image_ids()):
+        if main.image(image_id).name not in kept:
+            main.deregister_frame(main.image(image_id).frame_id)
+    assert main.num_reg_images() == 2
+    vlads = describe_photos(work, copies, 0)
+    models = map_rest(work, copies, vlads, main, {}, SfmConfig(), silent)
+    assert models[0].num_reg_images() > main.num_reg_images()
+    assert {2, 3, 4}.isdisjoint(missing_from(models[0], copies))
+
+
+def test_fewer_than_three_photos_are_no_model(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
+    work, copies = matched
+    rest = [copy.work_name for copy in copies[:LOST]]
+    main = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
+    vlads = describe_photos(work, copies, 0)
+    assert map_rest(work, copies, vlads, main, {}, SfmConfig(), silent) == []

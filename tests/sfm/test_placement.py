@@ -1,9 +1,9 @@
-from wildgs.sfm.placement import Failure, _groups, other_places
+from wildgs.sfm.placement import Failure, find_groups, other_places
 
 
 def test_photos_that_match_each_other_alone_form_a_group() -> None:
     matches = {(0, 1): 500, (1, 2): 90, (2, 3): 40, (4, 5): 29, (3, 6): 12, (5, 7): 35}
-    groups = _groups([1, 2, 3, 4, 5, 6], matches)
+    groups = find_groups([1, 2, 3, 4, 5, 6], matches)
     assert [sorted(groups[photo]) for photo in (1, 2, 3)] == [[1, 2, 3]] * 3  # 0 has a pose
     assert [groups[photo] for photo in (4, 5, 6)] == [
         [4],
@@ -13,12 +13,12 @@ def test_photos_that_match_each_other_alone_form_a_group() -> None:
 
 
 def test_groups_that_a_later_pair_links_become_one() -> None:
-    groups = _groups([0, 1, 2, 3], {(0, 1): 50, (2, 3): 50, (1, 3): 50})
+    groups = find_groups([0, 1, 2, 3], {(0, 1): 50, (2, 3): 50, (1, 3): 50})
     assert all(sorted(group) == [0, 1, 2, 3] for group in groups.values())
 
 
 def test_photos_of_a_smaller_model_form_a_group() -> None:
-    groups = _groups([1, 2, 3, 4, 5], {(3, 4): 50}, [[1, 2, 3]])  # few matches each, but one model
+    groups = find_groups([1, 2, 3, 4, 5], {(3, 4): 50}, [[1, 2, 3]])  # few matches each, but one model
     assert sorted(groups[1]) == sorted(groups[4]) == [1, 2, 3, 4]
     assert groups[5] == [5]
 

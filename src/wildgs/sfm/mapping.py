@@ -49,18 +49,31 @@ def quiet() -> Iterator[None]:
 
 
 def map_repeatedly(
-    work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    config: SfmConfig,
+    progress: Progress,
+    only: Sequence[WorkingCopy] = (),
 ) -> list[Any]:
     """Repeats incremental mapping with other seeds while photos are missing; returns the models of the best run.
 
     The best run is the one whose largest model has the most observations.
+
+    Args:
+        work: The workplace.
+        copies: All photos.
+        config: Options.
+        progress: Called for every photo.
+        only: The photos to map; empty for all.
     """
     best: list[Any] = []
+    names = [copy.work_name for copy in only]
     for attempt in range(FIRST_ATTEMPTS if len(copies) <= ATTEMPTS_LIMIT else 1):
-        models = map_photos(work, len(copies), replace(config, seed=config.seed + attempt), progress)
+        seeded = replace(config, seed=config.seed + attempt)
+        models = map_photos(work, len(copies), seeded, progress, only=names)
         if models and (not best or models[0].compute_num_observations() > best[0].compute_num_observations()):
             best = models
-        if best and not missing_from(best[0], copies):
+        if best and not missing_from(best[0], only or copies):
             break
     return best
 

@@ -18,6 +18,7 @@ from wildgs.sfm.lenses import drop_impossible
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import (
     LEAST_GROUP,
+    by_size,
     continue_mapping,
     map_photos,
     map_repeatedly,
@@ -25,7 +26,7 @@ from wildgs.sfm.mapping import (
 )
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
 from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, friends_of_friends
-from wildgs.sfm.placement import Findings, PassName, count_neighbours
+from wildgs.sfm.placement import Findings, PassName, count_neighbours, find_groups
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -124,10 +125,39 @@ def _try_again(
     _note_new(models[0], main, passes, "third")
     models = _place_by_points(work, copies, vlads, [main], passes, "third", config, progress)
     drop_unsure(models[0], work, passes)
-    rest = [copies[photo].work_name for photo in missing_from(models[0], copies)]
-    if len(rest) >= LEAST_GROUP:
-        models = [models[0], *map_photos(work, len(copies), config, progress, only=rest)]
-    return models, more
+    return by_size([models[0], *map_rest(work, copies, vlads, models[0], passes, config, progress)]), more
+
+
+def map_rest(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    main: Any,
+    passes: dict[str, PassName],
+    config: SfmConfig,
+    progress: Progress,
+) -> list[Any]:
+    """Models of the photos that the main model leaves out.
+
+    If more of them belong together than the main model has, that is a model of another place which happened to be
+    found first. They are mapped alone, with several seeds, and with the second and third pass of their own.
+    """
+    rest = missing_from(main, copies)
+    if len(rest) < LEAST_GROUP:
+        return []
+    with closing(pycolmap.Database.open(work.database)) as database:
+        groups = find_groups(rest, verified_pairs(database, copies))
+    largest = max(groups.values(), key=len)
+    if len(largest) > main.num_reg_images():
+        models = map_repeatedly(work, copies, config, progress, [copies[row] for row in sorted(largest)])
+        if models:
+            models = _place_by_points(work, copies, vlads, models, passes, "second", config, progress)
+            grown = continue_mapping(work, models[0], len(copies), config, progress)
+            _note_new(models[0], grown, passes, "third")
+            models = _place_by_points(work, copies, vlads, [grown], passes, "third", config, progress)
+            drop_unsure(models[0], work, passes)
+        return models
+    return map_photos(work, len(copies), config, progress, [copies[row].work_name for row in rest])
 
 
 def _place_by_points(

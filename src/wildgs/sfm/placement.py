@@ -124,7 +124,7 @@ def failures(
     together = [
         [row for row in missing if find_registered(model, copies[row]) is not None] for model in models[1:]
     ]
-    groups = _groups(missing, found, together)
+    groups = find_groups(missing, found, together)
     result = {}
     for row in missing:
         inliers, partner = best.get(row, (0, row))
@@ -137,12 +137,17 @@ def failures(
     return result
 
 
-def _groups(
+def find_groups(
     missing: Sequence[int], found: Mapping[Pair, int], together: Iterable[Sequence[int]] = ()
 ) -> dict[int, list[int]]:
     """The photos without a pose that each of them belongs with, itself included.
 
     They are linked by matches with each other, or are `together` in a smaller model.
+
+    Args:
+        missing: Photos without a pose.
+        found: Number of verified matches by pair of photos.
+        together: Photos of each smaller model.
     """
     group = {row: [row] for row in missing}
     matched = [pair for pair, inliers in found.items() if inliers >= GROUP_MATCHES]
