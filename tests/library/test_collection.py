@@ -112,7 +112,7 @@ def test_other_photos_are_refused_by_a_run_that_has_poses(photos: Path, scene: P
 def test_other_options_than_those_of_the_poses_are_refused(photos: Path, scene: Path) -> None:
     """They would be dropped without a word; threads decide nothing, and a default may stand for what was given."""
     asked = SfmConfig(max_features=900, pairing=PairingConfig(neighbours=7), threads=1)
-    with pytest.raises(UserError, match=r"--neighbours was 16, not 7, --max-features was 500, not 900"):
+    with pytest.raises(UserError, match=r"--neighbours was 32, not 7, --max-features was 500, not 900"):
         wildgs.run(photos, scene.parent, sfm=asked)
     assert not changed_options(scene, SfmConfig(threads=2))
 
