@@ -69,9 +69,12 @@ def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[
             main.deregister_frame(main.image(image_id).frame_id)
     assert main.num_reg_images() == 2
     vlads = describe_photos(work, copies, 0)
-    models = map_rest(work, copies, vlads, main, {}, SfmConfig(), silent)
+    passes: dict[str, PassName] = {}
+    models = map_rest(work, copies, vlads, main, passes, SfmConfig(), silent)
     assert models[0].num_reg_images() > main.num_reg_images()
     assert {2, 3, 4}.isdisjoint(missing_from(models[0], copies))
+    joined = {name for name in kept if models[0].find_image_with_name(name) is not None}
+    assert joined <= set(passes), "in this model, they were registered by a later pass"
 
 
 def test_fewer_than_three_photos_are_no_model(matched: tuple[Workplace, list[WorkingCopy]]) -> None:

@@ -121,11 +121,30 @@ def _try_again(
         work.set_done("more matches")
     if not models:
         return map_photos(work, len(copies), config, progress), more
-    main = continue_mapping(work, models[0], len(copies), config, progress)
-    _note_new(models[0], main, passes, "third")
-    models = _place_by_points(work, copies, vlads, [main], passes, "third", config, progress)
-    drop_unsure(models[0], work, passes)
-    return by_size([models[0], *map_rest(work, copies, vlads, models[0], passes, config, progress)]), more
+    main = _third_pass(work, copies, vlads, models[0], passes, config, progress)
+    own: dict[str, PassName] = {}
+    models = by_size([main, *map_rest(work, copies, vlads, main, own, config, progress)])
+    if models[0] is not main:
+        passes.clear()
+        passes.update(own)
+    return models, more
+
+
+def _third_pass(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    model: Any,
+    passes: dict[str, PassName],
+    config: SfmConfig,
+    progress: Progress,
+) -> Any:
+    """Registers further photos with fewer inliers, matches others to the points again, and drops unsure ones."""
+    grown = continue_mapping(work, model, len(copies), config, progress)
+    _note_new(model, grown, passes, "third")
+    main = _place_by_points(work, copies, vlads, [grown], passes, "third", config, progress)[0]
+    drop_unsure(main, work, passes)
+    return main
 
 
 def map_rest(
@@ -140,7 +159,8 @@ def map_rest(
     """Models of the photos that the main model leaves out.
 
     If more of them belong together than the main model has, that is a model of another place which happened to be
-    found first. They are mapped alone, with several seeds, and with the second and third pass of their own.
+    found first. They are mapped alone, with several seeds, and with the second and third pass of their own, which
+    are noted in `passes`.
     """
     rest = missing_from(main, copies)
     if len(rest) < LEAST_GROUP:
@@ -152,10 +172,7 @@ def map_rest(
         models = map_repeatedly(work, copies, config, progress, [copies[row] for row in sorted(largest)])
         if models:
             models = _place_by_points(work, copies, vlads, models, passes, "second", config, progress)
-            grown = continue_mapping(work, models[0], len(copies), config, progress)
-            _note_new(models[0], grown, passes, "third")
-            models = _place_by_points(work, copies, vlads, [grown], passes, "third", config, progress)
-            drop_unsure(models[0], work, passes)
+            models[0] = _third_pass(work, copies, vlads, models[0], passes, config, progress)
         return models
     return map_photos(work, len(copies), config, progress, [copies[row].work_name for row in rest])
 
