@@ -31,6 +31,7 @@ MENDED = {
     "model.ground.points": 0,
     "model.sky.points": 0,
     "train.dropout.rate": 0.0,
+    "train.flat_ground.rate": 0.0,
     "model.sky.densify": True,
     "model.color_match": False,
     "model.light_codes": 0,

@@ -44,6 +44,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.density.min_visibility": (0, 1),
     "train.dropout.rate": (0, 0.9),
     "train.dropout.neighbours": (1, 1024),
+    "train.flat_ground.rate": (0, 1),
+    "train.flat_ground.height": (0, _MAX_VALUE),
     "model.mask_threshold": (0, 1),
     "model.matched_loss": (0, 1),
     "model.light_codes": (0, 64),

@@ -25,6 +25,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "schedule", "planes_every"): ("mask_pause", 1),
     ("train", "schedule", "mask_visits"): ("mask_pause", 0),
     ("train", "dropout"): ("density", {"rate": 0.0}),
+    ("train", "flat_ground"): ("density", {"rate": 0.0}),
     ("train", "density", "strategy"): ("split_scale", "classic"),
 }
 """Entries that were added later: path -> (a sibling by which an older file is recognised, the older behaviour)."""

@@ -134,6 +134,23 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
+class FlatGroundConfig:
+    """Gaussians that few photos show are kept on the ground plane (`wildgs.engine.flat_ground`). Not in the paper.
+
+    Attributes:
+        rate: Fraction of its distance from the ground plane that a Gaussian moves towards it per step if at most a
+            quarter of --flat-ground.photos show it. 0 = off.
+        photos: Gaussians that this many training photos show are not moved; the rate falls linearly up to it.
+        height: Largest height above the plane of Gaussians that are moved, relative to that of the lowest quarter
+            of the cameras.
+    """
+
+    rate: float = 0.01
+    photos: int = 12
+    height: float = 0.5
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Training.
 
@@ -147,6 +164,7 @@ class TrainConfig:
         optimizer: Learning rates of the geometry.
         density: Densification and pruning.
         dropout: Dropout of Gaussians, for scenes of few photos.
+        flat_ground: Ground that few photos show is kept flat.
     """
 
     steps: int = 30_000
@@ -157,6 +175,7 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     dropout: DropoutConfig = field(default_factory=DropoutConfig)
+    flat_ground: FlatGroundConfig = field(default_factory=FlatGroundConfig)
 
     def __post_init__(self) -> None:
         """Validates the number of steps."""

@@ -1,4 +1,4 @@
-"""Counts how many training photos show each Gaussian, for dropout (`wildgs.model.dropout`)."""
+"""Counts how many training photos show each Gaussian, for dropout and the flat ground."""
 
 from __future__ import annotations
 
@@ -27,26 +27,28 @@ SIDE = 0.5
 class PhotoCounts:
     """Keeps the numbers of photos that show each Gaussian up to date in training, and derives dropout rates."""
 
-    def __init__(self, method: Method, config: DropoutConfig, steps: int) -> None:
+    def __init__(self, method: Method, config: DropoutConfig, steps: int, *, needed: bool = False) -> None:
         """Starts without numbers, hence without dropout.
 
         Args:
             method: The method; the numbers are kept as `Gaussians.photos`, which density control edits.
             config: Options of dropout.
             steps: Number of steps of the run.
+            needed: Whether photos are counted even without dropout.
         """
         self._method, self._config, self._steps = method, config, steps
-        self._used = method.uses_dropout and config.rate > 0
+        self._drops = method.uses_dropout and config.rate > 0
+        self._counts = self._drops or needed
 
     def update(self, step: int, feed: PhotoFeed) -> None:
         """Counts before the step after `step`, if it is time."""
-        if self._used and is_due(step, feed.team.size, self._steps):
+        if self._counts and is_due(step, feed.team.size, self._steps):
             self._method.gaussians.photos = count_photos(self._method.gaussians, feed)
 
     def dropout_rates(self) -> Float[Tensor, "N"] | None:
         """Probability of each Gaussian to be dropped; None without dropout, and before the first count."""
         photos = self._method.gaussians.photos
-        return dropout_rates(self._config, photos) if self._used and photos is not None else None
+        return dropout_rates(self._config, photos) if self._drops and photos is not None else None
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs to continue in the same way."""

@@ -17,6 +17,7 @@ from wildgs.engine.config import TrainConfig
 from wildgs.engine.consensus import Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
+from wildgs.engine.flat_ground import FlatGround
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.photo_counts import PhotoCounts
 from wildgs.engine.process_settings import ProcessSettings
@@ -102,7 +103,8 @@ class Trainer:
         objective = config.objective
         evident = objective.consensus and objective.mask_gradient == "evidence"
         self.consensus = Consensus(self.device, len(self.views), self.schedule.mask_steps if evident else 0)
-        self.photo_counts = PhotoCounts(method, config.dropout, config.steps)
+        self.flat_ground = FlatGround(method, scene, config.flat_ground)
+        self.photo_counts = PhotoCounts(method, config.dropout, config.steps, needed=self.flat_ground.is_used)
         self.guard = StepGuard()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
@@ -181,6 +183,7 @@ class Trainer:
         before = self.step
         self.step = min(before + self.team.size, self.config.steps)
         taken = self.step - before
+        self.flat_ground.update(self.step, taken)
         density = self._control_density(taken)
         self.seconds += time.perf_counter() - start
         return StepReport(

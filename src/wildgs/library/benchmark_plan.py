@@ -21,7 +21,7 @@ from wildgs.presets import PRESETS, PresetName, with_preset
 from wildgs.scene.colmap import find_model
 from wildgs.scene.split import find_split_file
 
-_ABLATION_LABELS = {"reverse": "w/o {c'}"}
+_ABLATION_LABELS = {"reverse": "w/o {c'}", "flat-ground": "w/o Flat Ground"}
 
 PHOTOTOURISM_DOWNSCALE = 2
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")

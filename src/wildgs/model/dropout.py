@@ -15,8 +15,19 @@ from torch import Tensor
 
 from wildgs.model.config import DropoutConfig
 
-FULL_RATE = 0.25
-"""Fraction of `DropoutConfig.photos` up to which the dropout rate is at its maximum."""
+FULL_SHARE = 0.25
+"""Fraction of the limiting number of photos up to which `rareness` is 1."""
+
+
+def rareness(photos: Float[Tensor, "N"], limit: int) -> Float[Tensor, "N"]:
+    """1 for Gaussians that at most a quarter of `limit` photos show, falling linearly to 0 at `limit`.
+
+    Args:
+        photos: Effective number of photos that show each Gaussian.
+        limit: Number of photos; 0 gives 0 for all.
+    """
+    share = (1 - photos / limit) / (1 - FULL_SHARE) if limit else torch.zeros_like(photos)
+    return share.clamp(0, 1)
 
 
 def dropout_rates(config: DropoutConfig, photos: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -26,8 +37,7 @@ def dropout_rates(config: DropoutConfig, photos: Float[Tensor, "N"]) -> Float[Te
         config: The maximum, and the number of photos from which nothing is dropped.
         photos: Effective number of photos that show each Gaussian.
     """
-    share = (1 - photos / config.photos) / (1 - FULL_RATE) if config.photos else torch.zeros_like(photos)
-    return config.rate * share.clamp(0, 1)
+    return config.rate * rareness(photos, config.photos)
 
 
 def opacity_factors(rates: Float[Tensor, "N"], neighbours: int) -> Float[Tensor, "N"]:

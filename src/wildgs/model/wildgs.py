@@ -46,6 +46,7 @@ class WildGS(Method):
     memory: ClassVar[MemoryUse] = MemoryUse(per_gaussian=6000, per_pixel=700, fixed=600 * 2**20)
     reset_every: ClassVar[int] = 0
     density: ClassVar[str] = "relocation"
+    flattens_ground = True
     uses_dropout = True
     config: WildGSConfig
 

@@ -163,6 +163,11 @@ def _level_plane(
     return plane
 
 
+def heights_above(plane: Float[Tensor, "3"], points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
+    """Vertical distance of points from a plane of `find_ground`, negative below it."""
+    return points[..., 2] - _padded(points) @ plane
+
+
 def _padded(points: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 3"]:
     """(x, y, 1) of points; the product with a plane's coefficients is its height at that position."""
     return torch.cat([points[..., :2], torch.ones_like(points[..., :1])], dim=-1)

@@ -1,0 +1,193 @@
+"""The ground that few photos show: moved onto its plane, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.engine.conftest import build_wall_scene
+from wildgs.engine import photo_counts
+from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
+from wildgs.engine.config import FlatGroundConfig
+from wildgs.engine.flat_ground import EVERY, REACH, THINNEST, FlatGround
+from wildgs.engine.report import StepReport
+from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.geometry.camera import quats_to_rotations
+from wildgs.model.config import DropoutConfig
+from wildgs.model.method import Method
+from wildgs.model.registry import MethodName, create_method, restore_method
+from wildgs.model.wildgs import WildGSConfig
+from wildgs.scene import Scene
+
+HEIGHT = 1.0
+CONFIG = FlatGroundConfig(rate=0.05, photos=12, height=0.5)
+
+
+def seen_from_above(scene: Scene) -> Scene:
+    """The wall as the ground z = 0, and cameras that look down on it from `HEIGHT`."""
+    views = []
+    for view in scene.views:
+        viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+        viewmat[:3, 3] = view.camera.viewmat[:3, 3] + torch.tensor([0.0, 0.0, HEIGHT])
+        views.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    return replace(scene, points=scene.points * torch.tensor([1.0, 1.0, 0.0]), views=tuple(views))
+
+
+@pytest.fixture
+def paving(wall_scene: Scene) -> Scene:
+    return seen_from_above(wall_scene)
+
+
+def method_for(scene: Scene, model: WildGSConfig, name: MethodName = "wildgs") -> Method:
+    torch.manual_seed(0)
+    return create_method(name, model if name == "wildgs" else None, scene)
+
+
+def place(method: Method, places: list[tuple[float, float, float]], photos: list[float]) -> None:
+    """Moves the first Gaussians to places, and sets the number of photos that show them (all others: many)."""
+    with torch.no_grad():
+        method.gaussians.means[: len(places)] = torch.tensor(places)
+    counts = torch.full((len(method.gaussians),), 100.0)
+    counts[: len(photos)] = torch.tensor(photos)
+    method.gaussians.photos = counts
+
+
+def test_only_what_few_photos_show_near_ground_and_cameras_moves(
+    paving: Scene, tiny_model: WildGSConfig
+) -> None:
+    method = method_for(paving, tiny_model)
+    far = 1.0 + 2 * REACH
+    places = [
+        (0, 0, 0.1),
+        (0, 0, -0.1),
+        (0, 0, 0.1),
+        (0, 0, 0.1),
+        (0, 0, 0.6),
+        (0, 0, -0.9),
+        (0, 0, -1.1),
+        (far, 0, 0.1),
+        (1e9, 0, 0.1),
+    ]
+    place(method, places, [1, 3, 7.5, 12, 1, 1, 1, 1, 1])
+    before = {name: row.detach().clone() for name, row in method.gaussians.rows.items()}
+    FlatGround(method, paving, CONFIG).update(EVERY, 1)
+    stays = (1 - CONFIG.rate) ** EVERY
+    half = 1 - (1 - stays) / 2
+    heights = method.gaussians.means[: len(places), 2].tolist()
+    expected = [0.1 * stays, -0.1 * stays, 0.1 * half, 0.1, 0.6, -0.9 * stays, -1.1, 0.1, 0.1]
+    assert heights == pytest.approx(expected, abs=1e-4)
+    assert torch.equal(method.gaussians.means[:, :2], before["means"][:, :2])
+    assert torch.equal(method.gaussians.means[len(places) :], before["means"][len(places) :])
+    for name in before.keys() - {"means", "log_scales"}:
+        assert torch.equal(method.gaussians.rows[name], before[name]), name
+
+
+def test_it_happens_at_fixed_steps_however_many_are_taken_at_once(
+    paving: Scene, tiny_model: WildGSConfig
+) -> None:
+    method = method_for(paving, tiny_model)
+    ground = FlatGround(method, paving, CONFIG)
+    ground.update(EVERY, 1)  # photos are not counted yet
+    place(method, [(0, 0, 0.1)], [1])
+    for step in range(1, EVERY):
+        ground.update(step, 1)
+    assert method.gaussians.means[0, 2].item() == pytest.approx(0.1)
+    ground.update(4 * EVERY, 4 * EVERY)
+    assert method.gaussians.means[0, 2].item() == pytest.approx(
+        0.1 * (1 - CONFIG.rate) ** (4 * EVERY), rel=1e-3
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_in_the_end_they_are_flat_whatever_their_rotation(seed: int) -> None:
+    scene = seen_from_above(build_wall_scene())
+    method = create_method("3dgs", None, scene)
+    method.flattens_ground = True
+    generator = torch.Generator().manual_seed(seed)
+    count = 50
+    with torch.no_grad():
+        rows = method.gaussians.rows
+        rows["means"][:count] = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.2])
+        rows["quats"][:count] = torch.randn(count, 4, generator=generator)
+        rows["log_scales"][:count] = torch.randn(count, 3, generator=generator) - 3
+    before = rows["log_scales"][:count].exp().clone()
+    method.gaussians.photos = torch.ones(len(method.gaussians))
+    FlatGround(method, scene, replace(CONFIG, rate=1.0)).update(EVERY, 1)
+    scales = rows["log_scales"][:count].exp()
+    axes = quats_to_rotations(rows["quats"][:count])
+    thin = axes[:, 2].abs().argmax(dim=1, keepdim=True)
+    thickness = scales.gather(1, thin)[:, 0]
+    wide = (scales.sum(dim=1) - thickness) / 2
+    torch.testing.assert_close(rows["means"][:count, 2], torch.zeros(count), atol=1e-5, rtol=0)
+    assert bool((thickness <= THINNEST * wide * 1.001).all())
+    kept = torch.ones_like(before, dtype=torch.bool).scatter(1, thin, False)
+    assert torch.equal(scales[kept], before[kept])
+    assert bool((scales <= before * 1.001).all())
+
+
+def test_without_level_ground_nothing_is_used(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    method = method_for(wall_scene, tiny_model)
+    assert not FlatGround(method, wall_scene, CONFIG).is_used  # the cameras are below its only plane
+    place(method, [(0, 0, 0.9)], [1])
+    before = method.gaussians.means.detach().clone()
+    FlatGround(method, wall_scene, CONFIG).update(EVERY, 1)
+    assert torch.equal(method.gaussians.means, before)
+
+
+@pytest.mark.parametrize("name", ["3dgs", "affine"])
+def test_other_methods_keep_their_ground(paving: Scene, tiny_model: WildGSConfig, name: MethodName) -> None:
+    assert not FlatGround(method_for(paving, tiny_model, name), paving, CONFIG).is_used
+
+
+def test_it_can_be_switched_off(paving: Scene, tiny_model: WildGSConfig) -> None:
+    assert not FlatGround(method_for(paving, tiny_model), paving, replace(CONFIG, rate=0.0)).is_used
+
+
+def trainer_for(scene: Scene, model: WildGSConfig, rate: float = 0.05) -> Trainer:
+    config = TrainConfig(
+        steps=60,
+        precision="float32",
+        dropout=DropoutConfig(rate=0.0),
+        flat_ground=replace(CONFIG, rate=rate),
+    )
+    return Trainer(method_for(scene, model), scene, config)
+
+
+def test_training_counts_photos_for_it_and_a_resumed_run_ends_in_the_same_bits(
+    paving: Scene, tiny_model: WildGSConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 20)
+    whole = trainer_for(paving, tiny_model)
+
+    def save(report: StepReport) -> None:
+        if report.step == 35:
+            save_checkpoint(tmp_path, 35, whole.state(), {})
+
+    whole.run([save])
+    assert whole.photo_counts.dropout_rates() is None
+    checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
+    resumed = Trainer(restore_method("wildgs", tiny_model, checkpoint.method), paving, whole.config)
+    resumed.restore(checkpoint.state)
+    resumed.run()
+    ours, theirs = whole.state(), resumed.state()
+    different = [n for n in ours if n != "progress.seconds" and not torch.equal(ours[n], theirs[n])]
+    assert different == []
+
+
+def test_the_ground_is_flatter_with_it(
+    paving: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 10)
+    spread = []
+    for rate in (0.0, 0.05):
+        trainer = trainer_for(paving, tiny_model, rate)
+        trainer.run()
+        heights = trainer.method.gaussians.means[:, 2].detach()
+        spread.append(float(heights[heights.abs() < 0.5].abs().mean()))
+    assert spread[1] < 0.7 * spread[0]
