@@ -145,9 +145,9 @@ class FlatGroundConfig:
             of the cameras.
     """
 
-    rate: float = 0.01
+    rate: float = 0.02
     photos: int = 12
-    height: float = 0.5
+    height: float = 0.25
 
 
 @dataclass(frozen=True)

@@ -117,11 +117,11 @@ class FlatGround:
         gaussians = self._method.gaussians
         if self._ground is not None and gaussians.photos is not None and falls_on(step, taken, EVERY):
             share = 1 - (1 - self._config.rate) ** max(EVERY, taken)
-            flatten(gaussians, self._ground, self._config.photos, share)
+            _flatten(gaussians, self._ground, self._config.photos, share)
 
 
 @torch.no_grad()
-def flatten(gaussians: Gaussians, ground: _Ground, photos: int, share: float) -> None:
+def _flatten(gaussians: Gaussians, ground: _Ground, photos: int, share: float) -> None:
     """Moves Gaussians towards the ground plane, and reduces their scales across it.
 
     Args:
