@@ -83,12 +83,13 @@ class _Ground:
 
     def is_near(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """Points close to the plane and to a camera."""
-        index = ((points[:, :2] - self.corner) / self.cell).floor()
-        most = torch.tensor(self.around.shape, device=points.device) - 1
-        inside = ((index >= 0) & (index <= most)).all(dim=1)
-        x, y = index.nan_to_num().clamp(min=torch.zeros_like(most), max=most).long().unbind(1)
+        # A point that is not finite is compared, and hence left out, by its height.
+        x, y = ((points[:, :2] - self.corner) / self.cell).floor().nan_to_num().unbind(1)
+        columns, rows = self.around.shape
+        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        around = self.around[x.clamp(0, columns - 1).long(), y.clamp(0, rows - 1).long()]
         heights = heights_above(self.plane, points)
-        return inside & self.around[x, y] & (heights < self.highest) & (heights > -self.deepest)
+        return inside & around & (heights < self.highest) & (heights > -self.deepest)
 
 
 class FlatGround:
