@@ -14,7 +14,7 @@ from tests.engine.conftest import build_wall_scene
 from wildgs.engine import photo_counts
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
 from wildgs.engine.config import FlatGroundConfig
-from wildgs.engine.flat_ground import EVERY, REACH, THINNEST, FlatGround
+from wildgs.engine.flat_ground import EVERY, HIGHEST_EYES, REACH, THINNEST, FlatGround
 from wildgs.engine.report import StepReport
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.geometry.camera import quats_to_rotations
@@ -24,16 +24,17 @@ from wildgs.model.registry import MethodName, create_method, restore_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.scene import Scene
 
-HEIGHT = 1.0
 CONFIG = FlatGroundConfig(rate=0.05, photos=12, height=0.5)
+EYES = HIGHEST_EYES
+"""The height that counts of cameras that are higher."""
 
 
-def seen_from_above(scene: Scene) -> Scene:
-    """The wall as the ground z = 0, and cameras that look down on it from `HEIGHT`."""
+def seen_from_above(scene: Scene, height: float = 1.0) -> Scene:
+    """The wall as the ground z = 0, and cameras that look down on it from a height."""
     views = []
     for view in scene.views:
         viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-        viewmat[:3, 3] = view.camera.viewmat[:3, 3] + torch.tensor([0.0, 0.0, HEIGHT])
+        viewmat[:3, 3] = view.camera.viewmat[:3, 3] + torch.tensor([0.0, 0.0, height])
         views.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
     return replace(scene, points=scene.points * torch.tensor([1.0, 1.0, 0.0]), views=tuple(views))
 
@@ -57,21 +58,35 @@ def place(method: Method, places: list[tuple[float, float, float]], photos: list
     method.gaussians.photos = counts
 
 
+@pytest.mark.parametrize(("above", "counts"), [(0.08, 0.08), (3.0, HIGHEST_EYES)])
+def test_what_is_moved_depends_on_the_height_of_the_cameras_up_to_a_limit(
+    wall_scene: Scene, tiny_model: WildGSConfig, above: float, counts: float
+) -> None:
+    scene = seen_from_above(wall_scene, above)
+    method = method_for(scene, tiny_model)
+    place(method, [(0, 0, 0.45 * counts), (0, 0, 0.55 * counts)], [1, 1])
+    FlatGround(method, scene, CONFIG).update(EVERY, 1)
+    low, high = (method.gaussians.means[:2, 2] / counts).tolist()
+    assert low < 0.4
+    assert high == pytest.approx(0.55, rel=1e-4)
+
+
 def test_only_what_few_photos_show_near_ground_and_cameras_moves(
     paving: Scene, tiny_model: WildGSConfig
 ) -> None:
     method = method_for(paving, tiny_model)
     far = 1.0 + 2 * REACH
+    low, high, deep = 0.4 * EYES, 0.6 * EYES, 0.9 * EYES
     places = [
-        (0, 0, 0.1),
-        (0, 0, -0.1),
-        (0, 0, 0.1),
-        (0, 0, 0.1),
-        (0, 0, 0.6),
-        (0, 0, -0.9),
-        (0, 0, -1.1),
-        (far, 0, 0.1),
-        (1e9, 0, 0.1),
+        (0, 0, low),
+        (0, 0, -low),
+        (0, 0, low),
+        (0, 0, low),
+        (0, 0, high),
+        (0, 0, -deep),
+        (0, 0, -1.1 * EYES),
+        (far, 0, low),
+        (1e9, 0, low),
     ]
     place(method, places, [1, 3, 7.5, 12, 1, 1, 1, 1, 1])
     before = {name: row.detach().clone() for name, row in method.gaussians.rows.items()}
@@ -79,7 +94,7 @@ def test_only_what_few_photos_show_near_ground_and_cameras_moves(
     stays = (1 - CONFIG.rate) ** EVERY
     half = 1 - (1 - stays) / 2
     heights = method.gaussians.means[: len(places), 2].tolist()
-    expected = [0.1 * stays, -0.1 * stays, 0.1 * half, 0.1, 0.6, -0.9 * stays, -1.1, 0.1, 0.1]
+    expected = [low * stays, -low * stays, low * half, low, high, -deep * stays, -1.1 * EYES, low, low]
     assert heights == pytest.approx(expected, abs=1e-4)
     assert torch.equal(method.gaussians.means[:, :2], before["means"][:, :2])
     assert torch.equal(method.gaussians.means[len(places) :], before["means"][len(places) :])
@@ -93,13 +108,13 @@ def test_it_happens_at_fixed_steps_however_many_are_taken_at_once(
     method = method_for(paving, tiny_model)
     ground = FlatGround(method, paving, CONFIG)
     ground.update(EVERY, 1)  # photos are not counted yet
-    place(method, [(0, 0, 0.1)], [1])
+    place(method, [(0, 0, 0.05)], [1])
     for step in range(1, EVERY):
         ground.update(step, 1)
-    assert method.gaussians.means[0, 2].item() == pytest.approx(0.1)
+    assert method.gaussians.means[0, 2].item() == pytest.approx(0.05)
     ground.update(4 * EVERY, 4 * EVERY)
     assert method.gaussians.means[0, 2].item() == pytest.approx(
-        0.1 * (1 - CONFIG.rate) ** (4 * EVERY), rel=1e-3
+        0.05 * (1 - CONFIG.rate) ** (4 * EVERY), rel=1e-3
     )
 
 
@@ -113,7 +128,7 @@ def test_in_the_end_they_are_flat_whatever_their_rotation(seed: int) -> None:
     count = 50
     with torch.no_grad():
         rows = method.gaussians.rows
-        rows["means"][:count] = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.2])
+        rows["means"][:count] = torch.rand(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.05])
         rows["quats"][:count] = torch.randn(count, 4, generator=generator)
         rows["log_scales"][:count] = torch.randn(count, 3, generator=generator) - 3
     before = rows["log_scales"][:count].exp().clone()

@@ -35,6 +35,8 @@ LOWEST_CAMERAS = 0.25
 """Quantile of the cameras' heights above the plane by which distances from it are measured."""
 DEEPEST = 1.0
 """Largest depth below the plane of Gaussians that are moved, relative to that height."""
+HIGHEST_EYES = 0.12
+"""Cameras count as at most this high, in median depths. From a drone, a quarter of their height is houses."""
 THINNEST = 0.25
 """Thickness of a flat Gaussian up to which it is reduced, relative to its other two scales."""
 
@@ -68,7 +70,7 @@ class _Ground:
         if plane is None:
             return None
         above = heights_above(plane, centers)
-        eyes = float(above[above > 0].quantile(LOWEST_CAMERAS))
+        eyes = min(HIGHEST_EYES, float(above[above > 0].quantile(LOWEST_CAMERAS)))
         feet = centers[:, :2]
         corner = feet.min(dim=0).values - REACH
         sides = feet.max(dim=0).values + REACH - corner
