@@ -27,7 +27,7 @@ from wildgs.scene import Scene
 
 EVERY = 10
 """Steps between moves, each of which is as large as those of so many steps."""
-REACH = 0.6
+REACH = 1.5
 """Horizontal distance from a camera up to which the ground is flattened, in units of the aligned frame."""
 CELLS_IN_REACH, MOST_CELLS = 12, 1000
 """Cells of the map of the surroundings: within `REACH`, and at most along each side."""
