@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,6 +145,18 @@ def test_in_the_end_they_are_flat_whatever_their_rotation(seed: int) -> None:
     kept = torch.ones_like(before, dtype=torch.bool).scatter(1, thin, False)
     assert torch.equal(scales[kept], before[kept])
     assert bool((scales <= before * 1.001).all())
+
+
+def test_an_upright_needle_stays_finite(paving: Scene, tiny_model: WildGSConfig) -> None:
+    method = method_for(paving, tiny_model)
+    place(method, [(0, 0, 0.01)], [1])
+    with torch.no_grad():
+        method.gaussians.rows["quats"][0] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        method.gaussians.rows["log_scales"][0] = torch.tensor([-30.0, -40.0, -3.0])
+    FlatGround(method, paving, replace(CONFIG, rate=1.0)).update(EVERY, 1)
+    scales = method.gaussians.rows["log_scales"][0].detach()
+    assert scales[:2].tolist() == [-30.0, -40.0]
+    assert scales[2].item() == pytest.approx(-30.0 + math.log(THINNEST / 2), abs=1e-3)
 
 
 def test_without_level_ground_nothing_is_used(wall_scene: Scene, tiny_model: WildGSConfig) -> None:

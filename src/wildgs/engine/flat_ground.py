@@ -8,6 +8,7 @@ a Gaussian that a photo shows once in a hundred steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -144,6 +145,6 @@ def _flatten(gaussians: Gaussians, ground: _Ground, photos: int, share: float) -
     thin = (upwards @ axes).abs().argmax(dim=1, keepdim=True)
     scales = log_scales[rows]
     thickness = scales.gather(1, thin)[:, 0]
-    wide = (scales.exp().sum(dim=1) - thickness.exp()) / 2
-    excess = (thickness - (THINNEST * wide).log()).clamp_min(0)
+    wide = scales.scatter(1, thin, -torch.inf).logsumexp(dim=1)  # twice the mean of the other two
+    excess = (thickness - wide - math.log(THINNEST / 2)).clamp_min(0)
     log_scales[rows, thin[:, 0]] = thickness - pull * excess
