@@ -177,9 +177,9 @@ def test_it_can_be_switched_off(paving: Scene, tiny_model: WildGSConfig) -> None
     assert not FlatGround(method_for(paving, tiny_model), paving, replace(CONFIG, rate=0.0)).is_used
 
 
-def trainer_for(scene: Scene, model: WildGSConfig, rate: float = 0.05) -> Trainer:
+def trainer_for(scene: Scene, model: WildGSConfig, rate: float = 0.05, steps: int = 40) -> Trainer:
     config = TrainConfig(
-        steps=60,
+        steps=steps,
         precision="float32",
         dropout=DropoutConfig(rate=0.0),
         flat_ground=replace(CONFIG, rate=rate),
@@ -190,12 +190,12 @@ def trainer_for(scene: Scene, model: WildGSConfig, rate: float = 0.05) -> Traine
 def test_training_counts_photos_for_it_and_a_resumed_run_ends_in_the_same_bits(
     paving: Scene, tiny_model: WildGSConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 20)
+    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 10)
     whole = trainer_for(paving, tiny_model)
 
     def save(report: StepReport) -> None:
-        if report.step == 35:
-            save_checkpoint(tmp_path, 35, whole.state(), {})
+        if report.step == 25:
+            save_checkpoint(tmp_path, 25, whole.state(), {})
 
     whole.run([save])
     assert whole.photo_counts.dropout_rates() is None
@@ -214,7 +214,7 @@ def test_the_ground_is_flatter_with_it(
     monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 10)
     spread = []
     for rate in (0.0, 0.05):
-        trainer = trainer_for(paving, tiny_model, rate)
+        trainer = trainer_for(paving, tiny_model, rate, steps=30)
         trainer.run()
         heights = trainer.method.gaussians.means[:, 2].detach()
         spread.append(float(heights[heights.abs() < 0.5].abs().mean()))
