@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.engine.conftest import build_wall_scene
+from tests.engine.test_photo_counts import differences_after_resuming
 from wildgs.engine import photo_counts
-from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint, save_checkpoint
+from wildgs.engine.checkpoint import save_checkpoint
 from wildgs.engine.config import FlatGroundConfig
 from wildgs.engine.flat_ground import EVERY, HIGHEST_EYES, REACH, THINNEST, FlatGround
 from wildgs.engine.report import StepReport
@@ -21,7 +22,7 @@ from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.geometry.camera import quats_to_rotations
 from wildgs.model.config import DropoutConfig
 from wildgs.model.method import Method
-from wildgs.model.registry import MethodName, create_method, restore_method
+from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.scene import Scene
 
@@ -199,13 +200,7 @@ def test_training_counts_photos_for_it_and_a_resumed_run_ends_in_the_same_bits(
 
     whole.run([save])
     assert whole.photo_counts.dropout_rates() is None
-    checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
-    resumed = Trainer(restore_method("wildgs", tiny_model, checkpoint.method), paving, whole.config)
-    resumed.restore(checkpoint.state)
-    resumed.run()
-    ours, theirs = whole.state(), resumed.state()
-    different = [n for n in ours if n != "progress.seconds" and not torch.equal(ours[n], theirs[n])]
-    assert different == []
+    assert differences_after_resuming(whole, tmp_path, paving, tiny_model) == []
 
 
 def test_the_ground_is_flatter_with_it(

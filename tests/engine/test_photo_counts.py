@@ -128,6 +128,18 @@ def trainer_for(
     return Trainer(create_method(method, model if method == "wildgs" else None, scene), scene, config)
 
 
+def differences_after_resuming(
+    whole: Trainer, checkpoints: Path, scene: Scene, model: WildGSConfig
+) -> list[str]:
+    """Entries of the final state that differ if training is resumed from a checkpoint."""
+    checkpoint = load_checkpoint(list_checkpoints(checkpoints)[0])
+    resumed = Trainer(restore_method("wildgs", model, checkpoint.method), scene, whole.config)
+    resumed.restore(checkpoint.state)
+    resumed.run()
+    ours, theirs = whole.state(), resumed.state()
+    return [name for name in ours if name != "progress.seconds" and not torch.equal(ours[name], theirs[name])]
+
+
 @pytest.mark.parametrize("strategy", ["relocation", "classic", "mcmc"])
 def test_counts_follow_the_gaussians_and_a_resumed_run_ends_in_the_same_bits(
     wall_scene: Scene,
@@ -153,13 +165,7 @@ def test_counts_follow_the_gaussians_and_a_resumed_run_ends_in_the_same_bits(
 
     whole.run([save])
     assert edited, "no round of densification"
-    checkpoint = load_checkpoint(list_checkpoints(tmp_path)[0])
-    resumed = Trainer(restore_method("wildgs", tiny_model, checkpoint.method), wall_scene, whole.config)
-    resumed.restore(checkpoint.state)
-    resumed.run()
-    ours, theirs = whole.state(), resumed.state()
-    different = [n for n in ours if n != "progress.seconds" and not torch.equal(ours[n], theirs[n])]
-    assert different == []
+    assert differences_after_resuming(whole, tmp_path, wall_scene, tiny_model) == []
 
 
 def test_plain_3dgs_drops_nothing(

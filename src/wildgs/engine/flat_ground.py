@@ -22,7 +22,6 @@ from wildgs.geometry.camera import quats_to_rotations
 from wildgs.model.dropout import rareness
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
-from wildgs.priors.config import GroundConfig
 from wildgs.priors.ground import find_ground, heights_above
 from wildgs.scene import Scene
 
@@ -63,11 +62,12 @@ class _Ground:
     around: Bool[Tensor, "X Y"]
 
     @staticmethod
-    def of(scene: Scene, height: float, device: torch.device) -> _Ground | None:
-        """Finds the ground of a scene; None without a level ground below the cameras."""
+    def of(method: Method, scene: Scene, height: float) -> _Ground | None:
+        """Finds the ground of a scene as for initial Gaussians; None without a level one below the cameras."""
+        tolerance, device = method.initial(method.config).ground.tolerance, method.gaussians.means.device
         centers = torch.stack([view.camera.position for view in scene.train_views])
         generator = torch.Generator().manual_seed(0)
-        plane = find_ground(scene.points, centers, GroundConfig().tolerance, generator)
+        plane = find_ground(scene.points, centers, tolerance, generator)
         if plane is None:
             return None
         above = heights_above(plane, centers)
@@ -109,7 +109,7 @@ class FlatGround:
         self._method, self._config = method, config
         self._ground: _Ground | None = None
         if method.flattens_ground and config.rate > 0 and scene.train_views:
-            self._ground = _Ground.of(scene, config.height, method.gaussians.means.device)
+            self._ground = _Ground.of(method, scene, config.height)
 
     @property
     def is_used(self) -> bool:
