@@ -4,7 +4,8 @@
 #     benchmarks/gpu.sh [--scene DIR] [--wheels DIR] [--lpips DIR] [--output DIR] [--budget SECONDS] [--dry-run] [STAGE...]
 #
 # Stages, in this order, where none is named: install build parity eager graphs profile steps render train eval pack.
-# By name only: features (a step without each of WILDGS_WITHOUT's features), tests (all tests marked cuda).
+# By name only: host (where Python spends a step), features (a step without each of WILDGS_WITHOUT's features), tests
+# (all tests marked cuda).
 # Each has a limit, and its results are on disk before the next begins; what fails or runs out of time is in the JSON with
 # its exit code (124: out of time) and the rest continues. The limits leave the last RESERVE seconds of the budget to
 # training and what follows. An interrupted build or training continues with a second call and the same OUTPUT.
@@ -27,7 +28,7 @@ while [ $# -gt 0 ]; do
     --output) output=$2; shift 2 ;;
     --budget) budget=$2; shift 2 ;;
     --dry-run) dry=1; shift ;;
-    -h | --help) sed -n '2,19p' "${BASH_SOURCE[0]}"; exit 0 ;;
+    -h | --help) sed -n '2,20p' "${BASH_SOURCE[0]}"; exit 0 ;;
     -*) echo "gpu.sh: unknown option $1; --help lists the options" >&2; exit 2 ;;
     *) stages+=("$1"); shift ;;
   esac
@@ -145,6 +146,7 @@ for stage in "${stages[@]}"; do
     eager) run eager 40 "$reserve" env CUDA_LAUNCH_BLOCKING=1 "$python" benchmarks/gpu_stages.py eager "${tiny[@]}" ;;
     graphs) run graphs 40 "$reserve" "$python" benchmarks/gpu_stages.py graphs "${tiny[@]}" ;;
     profile) run profile 40 "$reserve" "$python" benchmarks/gpu_stages.py profile "${tiny[@]}" ;;
+    host) run host 60 0 "$python" benchmarks/gpu_stages.py host "${tiny[@]}" ;;
     steps) run steps 35 "$reserve" "$python" benchmarks/train_step.py --json "${step_sizes[@]}" ;;
     render) run render 20 "$reserve" "$python" benchmarks/rasterize.py --json "${render_sizes[@]}" ;;
     features) run features 240 0 "$python" benchmarks/gpu_stages.py features "${tiny[@]}" ;;

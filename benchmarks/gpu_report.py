@@ -111,7 +111,7 @@ def gather(output: Path) -> dict[str, Any]:
     parts = output / "parts"
     rows = {
         name: read_lines(parts / f"{name}.out")
-        for name in ("eager", "graphs", "profile", "steps", "features")
+        for name in ("eager", "graphs", "profile", "host", "steps", "features")
     }
     render = read_lines(parts / "render.out")
     return {

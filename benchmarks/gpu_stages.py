@@ -3,6 +3,7 @@
     python benchmarks/gpu_stages.py eager       60 steps without CUDA graphs; run it with CUDA_LAUNCH_BLOCKING=1
     python benchmarks/gpu_stages.py graphs      200 steps without and with graphs: recorded, and the same losses
     python benchmarks/gpu_stages.py profile     10 steps at 1M and at 100k Gaussians: kernels and waits of the host
+    python benchmarks/gpu_stages.py host        a step's time without a profiler, and where Python spends it
     python benchmarks/gpu_stages.py features    a step's time with each of WILDGS_WITHOUT's features switched off
 
 --tiny: sizes for a dry run on the CPU. Exit code 1 where a stage finds that something is wrong.
@@ -11,9 +12,11 @@
 from __future__ import annotations
 
 import argparse
+import cProfile
 import json
 import math
 import os
+import pstats
 import sys
 import tempfile
 import time
@@ -166,6 +169,52 @@ def profile(scene: Scene, size: Size) -> bool:
     return True
 
 
+def host(scene: Scene, size: Size) -> bool:
+    """Steps that nothing observes, then the same under cProfile."""
+    for n in size.gaussians:
+        for method in ("wildgs", "3dgs"):
+            trainer = make_trainer(method, scene, n, default_device(), WildGSConfig())
+            for _ in range(WARM_UP if default_device().type == "cuda" else 1):
+                trainer.advance()
+            steps = size.graph_steps // 2
+            seconds = _seconds(trainer, steps)
+            profiler = cProfile.Profile()
+            profiler.enable()
+            profiled = _seconds(trainer, steps)
+            profiler.disable()
+            trainer.end()
+            found = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
+            functions = [
+                {
+                    "name": _short(name),
+                    "calls": calls / steps,
+                    "own_ms": 1e3 * own / steps,
+                    "ms": 1e3 * total / steps,
+                }
+                for name, (_, calls, own, total, _) in sorted(found.items(), key=lambda each: -each[1][3])[
+                    :120
+                ]
+            ]
+            say(stage="host", method=method, n=n, step_ms=1e3 * seconds / steps,
+                profiled_ms=1e3 * profiled / steps, functions=functions)  # fmt: skip
+    return True
+
+
+def _seconds(trainer: Trainer, steps: int) -> float:
+    """The time of steps, until the device has done them."""
+    start = time.perf_counter()
+    for _ in range(steps):
+        trainer.advance()
+    if default_device().type == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def _short(name: tuple[str, int, str]) -> str:
+    file, line, function = name
+    return f"{Path(file).name}:{line} {function}" if line else function[:80]
+
+
 def features(scene: Scene, size: Size) -> bool:
     """A step's time with all features, then without each."""
     before = os.environ.get("WILDGS_WITHOUT", "")
@@ -185,7 +234,7 @@ def features(scene: Scene, size: Size) -> bool:
     return True
 
 
-STAGES = {"eager": eager, "graphs": graphs, "profile": profile, "features": features}
+STAGES = {"eager": eager, "graphs": graphs, "profile": profile, "host": host, "features": features}
 
 
 def main() -> int:

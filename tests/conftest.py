@@ -39,10 +39,11 @@ SHARED = Path(__file__).parents[2] / "shared"
 
 
 def _modules_to_check() -> list[str]:
-    """Every module but packages and those that hold Numba kernels, which a decorator would break."""
+    """Every module but packages and those that hold Numba or Triton kernels, which a decorator would break."""
     modules = []
     for file in sorted(SOURCE.rglob("*.py")):
-        if file.name != "__init__.py" and "njit" not in file.read_text(encoding="utf-8"):
+        text = file.read_text(encoding="utf-8")
+        if file.name != "__init__.py" and "njit" not in text and "triton.jit" not in text:
             modules.append(".".join(file.relative_to(SOURCE).with_suffix("").parts))
     return modules
 

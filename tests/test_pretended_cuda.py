@@ -54,7 +54,7 @@ def test_no_step_mixes_devices_and_all_learn_what_the_cpu_learns(output: Path) -
     assert [training["method"] for training in every] == ["3dgs", "wildgs", "affine", "wildgs"]
     for training in every:
         assert training["found"][:4] == pytest.approx(training["wanted"][:4], rel=1e-3), training["method"]
-        assert training["found"] == pytest.approx(training["wanted"], rel=2e-2), training["method"]
+        assert training["found"] == pytest.approx(training["wanted"], rel=5e-2), training["method"]
 
 
 def test_a_step_waits_for_what_its_sizes_depend_on_alone(output: Path) -> None:

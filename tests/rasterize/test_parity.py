@@ -95,15 +95,20 @@ def assert_same(case: Case, backend: str, tolerance: float = 1e-4) -> None:
     """Values to `tolerance` of each picture's largest, gradients to `tolerance` of each tensor's largest.
 
     Where float32 puts a pixel on the other side of a threshold (alpha 1/255, the cap, the stop) single numbers
-    differ by more; they may be one in a thousand.
+    differ by more; they may be one in a thousand. gsplat is compiled with approximate division, square root and
+    exponential: its gradients differ by up to 0.3% of the largest, and more numbers cross a threshold.
     """
+    approximate = backend == "cuda"
+    most_outliers = 1e-2 if approximate else 1e-3
+    if approximate:
+        tolerance = max(tolerance, 5e-3)
     projection, rendering, grads = render(case, backend, torch.float32)
     expected_projection, expected, expected_grads = render(case, "reference", torch.float64)
-    assert torch.equal(projection.visible.cpu(), expected_projection.visible)
-    assert ((projection.radii.cpu() - expected_projection.radii).abs() <= 1).all()
+    seen = assert_same_visible(projection, expected_projection, approximate)
     pairs = {k: (getattr(rendering, k), getattr(expected, k)) for k in ("colors", "depth", "alpha")}
     pairs |= {
-        k: (getattr(projection, k), getattr(expected_projection, k)) for k in ("means2d", "depths", "conics")
+        k: (getattr(projection, k).cpu()[seen], getattr(expected_projection, k)[seen])
+        for k in ("means2d", "depths", "conics")
     }
     pairs |= {f"gradient of {k}": (grads[k], expected_grads[k]) for k in grads}
     for name, (value, truth) in pairs.items():
@@ -114,7 +119,24 @@ def assert_same(case: Case, backend: str, tolerance: float = 1e-4) -> None:
         scale = truth.detach().abs().max().clamp(min=1e-2)
         assert value.isfinite().all(), name
         outliers = (difference > tolerance * scale).double().mean()
-        assert outliers <= 1e-3, f"{name}: {outliers:.2%} differ, by up to {difference.max() / scale:.2e}"
+        message = f"{name}: {outliers:.2%} differ, by up to {difference.max() / scale:.2e}"
+        assert outliers <= most_outliers, message
+
+
+def assert_same_visible(found: Projection, expected: Projection, approximate: bool) -> Tensor:
+    """Compares which Gaussians are visible, and their radii; returns those that both show.
+
+    gsplat culls by radii rounded up to whole pixels: Gaussians less than a pixel outside of the image, which
+    contribute nothing, stay visible.
+    """
+    visible, wanted = found.visible.cpu(), expected.visible
+    if not approximate:
+        assert torch.equal(visible, wanted)
+    assert (wanted & ~visible).double().mean() <= (5e-3 if approximate else 0) or len(wanted) == 0
+    both = visible & wanted
+    radii, wanted_radii = found.radii.cpu()[both], expected.radii[both]
+    assert ((radii - wanted_radii).abs() <= (2 + 0.02 * wanted_radii if approximate else 1)).all()
+    return both
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

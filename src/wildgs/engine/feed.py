@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from wildgs.devices import upload
+from wildgs.engine.device_cache import DeviceCache
 from wildgs.engine.team import Team
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
@@ -101,6 +101,7 @@ class PhotoFeed:
         self._cameras: dict[str, Camera] = {}
         self._points = torch.zeros(0, 3) if points is None else points
         self._sky: dict[str, Bool[Tensor, "_ _"]] = {}
+        self._kept = DeviceCache(device)
 
     def next_view(self) -> View:
         """The next readable photo; starts decoding the following ones in the background.
@@ -123,7 +124,8 @@ class PhotoFeed:
             batch = self.sampler.take(size)
             self.batch = ", ".join(self.views[index].name for index in batch)
             for index in self.sampler.upcoming(AHEAD * size)[rank::size]:
-                self.views[index].prefetch()
+                if ("photo", self.views[index].name) not in self._kept:
+                    self.views[index].prefetch()
             yield batch[rank]
             if size > 1:
                 following = range(batch[rank] + 1, batch[rank] + len(self.views))
@@ -131,7 +133,9 @@ class PhotoFeed:
                 return
 
     def is_readable(self, view: View) -> bool:
-        """Whether a photo can still be read; warns once if not."""
+        """Whether a photo can still be read, or need not be; warns once if not."""
+        if ("photo", view.name) in self._kept:
+            return True
         try:
             view.read_photo()
         except UserError as error:
@@ -143,17 +147,18 @@ class PhotoFeed:
 
     def photo(self, view: View) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
         """The photo and its valid pixels, see `View.load`."""
-        return view.load(self.device)
+        pixels = self._kept.get("photo", view.name, view.read_photo)
+        mask = self._kept.get("mask", view.name, view.read_mask)
+        assert pixels is not None
+        return pixels.float() / 255, None if mask is None else mask > 0
 
     def disparity(self, view: View) -> Float[Tensor, "H W"] | None:
         """The disparity map of the photo, if there is one."""
-        disparity = view.read_disparity()
-        return None if disparity is None else upload(disparity, self.device)
+        return self._kept.get("disparity", view.name, view.read_disparity)
 
     def depth(self, view: View) -> Float[Tensor, "H W"] | None:
         """The metric depth map of the photo, if there is one."""
-        depth = view.read_depth()
-        return None if depth is None else upload(depth, self.device)
+        return self._kept.get("depth", view.name, view.read_depth)
 
     def observations(self, view: View) -> Float[Tensor, "K 2"] | None:
         """Pixels (x, y) of the photo's triangulated points, if known."""

@@ -102,6 +102,10 @@ class Optimizers:
         """Current learning rate of the centres of the Gaussians."""
         return next(group["lr"] for group in self.rows.param_groups if group["name"] == "means")
 
+    def parameters(self) -> list[Tensor]:
+        """All trained parameters, found faster than by walking through the method's modules."""
+        return [parameter for _, _, parameter, _ in self._parameters()]
+
     def set_progress(self, progress: float) -> None:
         """Sets all learning rates for a fraction of the run, 0 to 1."""
         for optimizer, rates in ((self.rows, self.row_rates), (self.networks, self.network_rates)):

@@ -178,7 +178,7 @@ class Trainer:
             penalty = self.density.regularizer(self.method.gaussians, self.method.growable())
             losses = replace(losses, total=losses.total + penalty)
         losses.total.backward()
-        losses = self.team.average(self.method.parameters(), losses)
+        losses = self.team.average(self.optimizers.parameters(), losses)
         skipped = self._take(seen, losses) or skipped
         before = self.step
         self.step = min(before + self.team.size, self.config.steps)
@@ -209,12 +209,12 @@ class Trainer:
     def _take(self, seen: SeenView | None, losses: Losses) -> str | None:
         """Takes the optimisers' step if it is finite; returns why it was skipped, if already known."""
         if self.skips_on_device:
-            faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.method.parameters())
+            faulty = self.guard.mark(self.step + 1, self.feed.batch, losses, self.optimizers.parameters())
             if seen is not None:
                 self.density.gather(seen, self.team.pool, faulty == 0)
             self._step(faulty)
             return None
-        fault = self.guard.judge(self.feed.batch, losses, self.method.parameters())
+        fault = self.guard.judge(self.feed.batch, losses, self.optimizers.parameters())
         if fault is None:
             if seen is not None:
                 self.density.gather(seen, self.team.pool)

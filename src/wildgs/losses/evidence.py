@@ -149,7 +149,9 @@ def proven_static(observations: Float[Tensor, "K 2"], height: int, width: int) -
     """
     side = max(1, round(max(height, width) / PROOF_CELLS))
     rows, columns = -(-height // side), -(-width // side)
-    cells = torch.zeros(rows, columns, dtype=torch.bool, device=observations.device)
+    cells = torch.zeros(rows * columns, dtype=torch.bool, device=observations.device)
     x, y = (observations / side).long().unbind(1)
-    cells[y.clamp(0, rows - 1), x.clamp(0, columns - 1)] = True
+    # Unlike an assignment to indices, this does not upload the value, for which a GPU would be waited for.
+    cells.index_fill_(0, columns * y.clamp(0, rows - 1) + x.clamp(0, columns - 1), value=True)
+    cells = cells.reshape(rows, columns)
     return cells.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width]

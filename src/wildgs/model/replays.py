@@ -146,13 +146,15 @@ class Recording:
         """
         named = {name: p for name, p in part.named_parameters() if p.requires_grad}
         self.learnt = list(named.values())
-        # Separate leaves that share the parameters' memory, because the parameters' gradient accumulators may
-        # belong to an eager step and its stream, which would invalidate the capture.
-        aliases = {name: parameter.detach().requires_grad_() for name, parameter in named.items()}
         self._x = x.clone()
         self._anchor = torch.zeros((), device=x.device, requires_grad=True)
+        aliases: dict[str, Tensor] = {}
 
         def forward() -> Outputs:
+            # Separate leaves that share the parameters' memory, because the parameters' gradient accumulators may
+            # belong to an eager step and its stream, which would invalidate the capture. They are new in every
+            # pass, because those of the warm-up belong to its stream.
+            aliases.update({name: parameter.detach().requires_grad_() for name, parameter in named.items()})
             return torch.func.functional_call(part, aliases, (self._x,))
 
         def backward() -> Values:
