@@ -104,6 +104,20 @@ def test_only_what_few_photos_show_near_ground_and_cameras_moves(
         assert torch.equal(method.gaussians.rows[name], before[name]), name
 
 
+def test_a_camera_far_away_changes_nothing_for_the_others(paving: Scene, tiny_model: WildGSConfig) -> None:
+    stray = paving.views[0]
+    viewmat = stray.camera.viewmat.clone()
+    viewmat[0, 3] -= 1e5
+    stray = replace(stray, camera=replace(stray.camera, viewmat=viewmat))
+    scene = replace(paving, views=(stray, *paving.views[1:]))
+    method = method_for(scene, tiny_model)
+    place(method, [(0, 0, 0.4 * EYES), (1.0 + 2 * REACH, 0, 0.4 * EYES)], [1, 1])
+    FlatGround(method, scene, CONFIG).update(EVERY, 1)
+    near, far = (method.gaussians.means[:2, 2] / EYES).tolist()
+    assert near == pytest.approx(0.4 * (1 - CONFIG.rate) ** EVERY, rel=1e-3)
+    assert far == pytest.approx(0.4, rel=1e-3)
+
+
 def test_it_happens_at_fixed_steps_however_many_are_taken_at_once(
     paving: Scene, tiny_model: WildGSConfig
 ) -> None:

@@ -30,7 +30,8 @@ EVERY = 10
 REACH = 1.5
 """Horizontal distance from a camera up to which the ground is flattened, in units of the aligned frame."""
 CELLS_IN_REACH, MOST_CELLS = 12, 1000
-"""Cells of the map of the surroundings: within `REACH`, and at most along each side."""
+"""Cells of the map of the surroundings: within `REACH`, and at most along each side. Cameras
+beyond it, such as one with a wrong pose, are left out."""
 LOWEST_CAMERAS = 0.25
 """Quantile of the cameras' heights above the plane by which distances from it are measured."""
 DEEPEST = 1.0
@@ -72,11 +73,12 @@ class _Ground:
             return None
         above = heights_above(plane, centers)
         eyes = min(HIGHEST_EYES, float(above[above > 0].quantile(LOWEST_CAMERAS)))
-        feet = centers[:, :2]
+        cell, feet = REACH / CELLS_IN_REACH, centers[:, :2]
+        farthest = MOST_CELLS / 2 * cell - REACH
+        middle = feet[(feet - feet.median(dim=0).values).norm(dim=1).argmin()]
+        feet = feet[((feet - middle).abs() < farthest).all(dim=1)]
         corner = feet.min(dim=0).values - REACH
-        sides = feet.max(dim=0).values + REACH - corner
-        cell = max(REACH / CELLS_IN_REACH, float(sides.max()) / MOST_CELLS)
-        counts = (sides / cell).ceil().long()
+        counts = ((feet.max(dim=0).values + REACH - corner) / cell).ceil().long()
         places = torch.cartesian_prod(*(torch.arange(int(count)) for count in counts)).to(feet) + 0.5
         distance = torch.from_numpy(KDTree(feet.numpy()).query((corner + cell * places).numpy())[0])
         around = (distance < REACH).reshape(int(counts[0]), int(counts[1]))
