@@ -167,7 +167,7 @@ def spread_rows(
     values: Float[Tensor, "V *rest"], rows: Int[Tensor, " V"], count: int
 ) -> Float[Tensor, "N *rest"]:
     """The inverse of `take_rows`; other Gaussians get zero."""
-    return values.new_zeros(count, *values.shape[1:]).index_copy(0, rows, values)
+    return values.new_zeros(count, *values.shape[1:]).index_copy_(0, rows, values)
 
 
 class _TakeRows(torch.autograd.Function):

@@ -51,7 +51,9 @@ def is_sky(
     config: SkyConfig, points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]
 ) -> Bool[Tensor, "*batch"]:
     """Mask of the points farther from the centre than half of the sphere's radius."""
-    return (points - centre).norm(dim=-1) > 0.5 * config.radius
+    # On the CPU, a norm over three columns takes three times as long.
+    x, y, z = (points - centre).square().unbind(-1)
+    return x + y + z > (0.5 * config.radius) ** 2
 
 
 def sine_of_elevation(
