@@ -146,7 +146,7 @@ for stage in "${stages[@]}"; do
     eager) run eager 40 "$reserve" env CUDA_LAUNCH_BLOCKING=1 "$python" benchmarks/gpu_stages.py eager "${tiny[@]}" ;;
     graphs) run graphs 40 "$reserve" "$python" benchmarks/gpu_stages.py graphs "${tiny[@]}" ;;
     profile) run profile 40 "$reserve" "$python" benchmarks/gpu_stages.py profile "${tiny[@]}" ;;
-    host) run host 60 0 "$python" benchmarks/gpu_stages.py host "${tiny[@]}" ;;
+    host) run host 100 0 "$python" benchmarks/gpu_stages.py host "${tiny[@]}" ;;
     steps) run steps 35 "$reserve" "$python" benchmarks/train_step.py --json "${step_sizes[@]}" ;;
     render) run render 20 "$reserve" "$python" benchmarks/rasterize.py --json "${render_sizes[@]}" ;;
     features) run features 240 0 "$python" benchmarks/gpu_stages.py features "${tiny[@]}" ;;

@@ -20,6 +20,7 @@ STAGES = [
     "eager",
     "graphs",
     "profile",
+    "host",
     "steps",
     "render",
     "train",
@@ -47,9 +48,10 @@ def test_every_stage_runs_and_leaves_its_result(forking_python: Path, landmark: 
     # Without a GPU pytest selects nothing that it could run, which is its exit code 5, or lists what it would run.
     assert codes == dict.fromkeys(STAGES[:-1], 0), (done.stdout, logs)
     assert all(row["well"] for name in ("eager", "graphs") for row in report[name] if "well" in row)
-    assert {(row["method"], row["n"]) for row in report["profile"]} == {
-        (method, n) for method in ("wildgs", "3dgs") for n in (300, 200)
-    }
+    for name in ("profile", "host"):
+        assert {(row["method"], row["n"]) for row in report[name]} == {
+            (method, n) for method in ("wildgs", "3dgs") for n in (300, 200)
+        }
     assert [row["method"] for row in report["steps"]] == ["3dgs", "wildgs"]
     assert report["render"][0]["frames_per_second"] > 0
     assert report["training"]["step"] == 4
