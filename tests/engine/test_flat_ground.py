@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.engine.conftest import build_wall_scene
 from tests.engine.test_photo_counts import differences_after_resuming
-from wildgs.engine import photo_counts
+from wildgs.engine import flat_ground, photo_counts
 from wildgs.engine.checkpoint import save_checkpoint
 from wildgs.engine.config import FlatGroundConfig
 from wildgs.engine.flat_ground import EVERY, HIGHEST_EYES, REACH, THINNEST, FlatGround
@@ -102,6 +102,21 @@ def test_only_what_few_photos_show_near_ground_and_cameras_moves(
     assert torch.equal(method.gaussians.means[len(places) :], before["means"][len(places) :])
     for name in before.keys() - {"means", "log_scales"}:
         assert torch.equal(method.gaussians.rows[name], before[name]), name
+
+
+def test_the_ground_of_depth_maps_counts_where_sfm_found_none(
+    paving: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = replace(paving, points=paving.points[:20], point_colors=paving.point_colors[:20])
+    method = method_for(paving, tiny_model)
+    assert not FlatGround(method, scene, CONFIG).is_used
+    dense = (paving.points, torch.zeros(len(paving.points), 3, dtype=torch.uint8))
+    monkeypatch.setattr(flat_ground, "depth_points", lambda *_: dense)
+    ground = FlatGround(method, scene, CONFIG)
+    place(method, [(0, 0, 0.4 * EYES)], [1])
+    ground.update(EVERY, 1)
+    stays = (1 - CONFIG.rate) ** EVERY
+    assert method.gaussians.means[0, 2].item() == pytest.approx(0.4 * EYES * stays, rel=1e-3)
 
 
 def test_a_camera_far_away_changes_nothing_for_the_others(paving: Scene, tiny_model: WildGSConfig) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from wildgs.priors.ground import GroundConfig, find_ground, ground_points
+from wildgs.priors.ground import GroundConfig, find_ground, ground_plane, ground_points
 
 CONFIG = GroundConfig(spacing=0.1)
 
@@ -44,6 +44,31 @@ def test_the_plane_is_found_among_walls(slope: tuple[float, float], seed: int) -
     plane = find_ground(points, cameras(), 0.03, torch.Generator().manual_seed(seed))
     assert plane is not None
     torch.testing.assert_close(plane, torch.tensor([*slope, -0.5]), atol=0.02, rtol=0)
+
+
+def test_depth_maps_count_only_where_sfm_found_no_ground() -> None:
+    lower = paving() - torch.tensor([0.0, 0.0, 0.1])
+
+    def never() -> torch.Tensor:
+        raise AssertionError
+
+    plane = ground_plane(torch.cat([paving(), wall()]), never, cameras(), 0.03)
+    assert plane is not None
+    torch.testing.assert_close(plane, torch.tensor([0.0, 0.0, -0.5]), atol=0.01, rtol=0)
+    plane = ground_plane(wall(), lambda: torch.cat([wall(), lower]), cameras(), 0.03)
+    assert plane is not None
+    torch.testing.assert_close(plane, torch.tensor([0.0, 0.0, -0.6]), atol=0.01, rtol=0)
+    assert ground_plane(wall(), wall, cameras(), 0.03) is None
+
+
+def test_the_ground_is_continued_at_the_height_of_the_points_of_sfm() -> None:
+    sparse = torch.cat([paving()[::4], wall()])
+    lower = paving() - torch.tensor([0.0, 0.0, 0.05])
+    points = torch.cat([sparse, lower])
+    alone, _ = ground_points(points, grey(points), cameras(), CONFIG)
+    filled, _ = ground_points(points, grey(points), cameras(), CONFIG, sparse=len(sparse))
+    assert float(alone[:, 2].median()) == pytest.approx(-0.55, abs=0.01)
+    assert float(filled[:, 2].median()) == pytest.approx(-0.5, abs=0.01)
 
 
 def test_the_hole_is_filled_and_what_is_known_is_not_doubled() -> None:

@@ -22,7 +22,8 @@ from wildgs.geometry.camera import quats_to_rotations
 from wildgs.model.dropout import rareness
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
-from wildgs.priors.ground import find_ground, heights_above
+from wildgs.priors.depth_points import depth_points
+from wildgs.priors.ground import ground_plane, heights_above
 from wildgs.scene import Scene
 
 EVERY = 10
@@ -65,10 +66,13 @@ class _Ground:
     @staticmethod
     def of(method: Method, scene: Scene, height: float) -> _Ground | None:
         """Finds the ground of a scene as for initial Gaussians; None without a level one below the cameras."""
-        tolerance, device = method.initial(method.config).ground.tolerance, method.gaussians.means.device
+        initial, device = method.initial(method.config), method.gaussians.means.device
         centers = torch.stack([view.camera.position for view in scene.train_views])
-        generator = torch.Generator().manual_seed(0)
-        plane = find_ground(scene.points, centers, tolerance, generator)
+
+        def surface() -> Float[Tensor, "P 3"]:
+            return torch.cat([scene.points, depth_points(scene, initial.depth_points)[0]])
+
+        plane = ground_plane(scene.points, surface, centers, initial.ground.tolerance)
         if plane is None:
             return None
         above = heights_above(plane, centers)

@@ -7,6 +7,7 @@ than two photos show, so a novel view in that direction would see through the sc
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -37,6 +38,7 @@ def ground_points(
     centers: Float[Tensor, "V 3"],
     config: GroundConfig,
     seed: int = 0,
+    sparse: int | None = None,
 ) -> tuple[Float[Tensor, "G 3"], UInt8[Tensor, "G 3"]]:
     """Generates points that continue the ground plane where the scene has no points.
 
@@ -46,6 +48,7 @@ def ground_points(
         centers: Camera centres.
         config: Number, spacing and extent of the new points.
         seed: Seed of the plane search.
+        sparse: How many of the first points are from SfM; None for all. See `ground_plane`.
 
     Returns:
         Positions and colours of the new points. Empty if no ground plane is found.
@@ -53,7 +56,7 @@ def ground_points(
     nothing = points[:0], colors[:0]
     if config.points == 0 or len(centers) == 0:
         return nothing
-    plane = find_ground(points, centers, config.tolerance, torch.Generator().manual_seed(seed))
+    plane = ground_plane(points[:sparse], lambda: points, centers, config.tolerance, seed)
     if plane is None:
         return nothing
     members = _members(points, plane[None], config.tolerance)[0]
@@ -85,6 +88,34 @@ def _places_around(feet: Float[Tensor, "V 2"], config: GroundConfig) -> Float[Te
     own = own[:: -(-len(own) // most)]
     cells = (own[:, None] + around).reshape(-1, 2).unique(dim=0)
     return (low + cells * config.spacing).to(feet.dtype)
+
+
+def ground_plane(
+    sparse: Float[Tensor, "P 3"],
+    surface: Callable[[], Float[Tensor, "Q 3"]],
+    centers: Float[Tensor, "V 3"],
+    tolerance: float,
+    seed: int = 0,
+) -> Float[Tensor, "3"] | None:
+    """Finds the ground by the points of SfM, or by further points where those are too few.
+
+    Where photos disagree about the depth of the ground, points from depth maps lie in several layers
+    (`wildgs.priors.depth_points`), which lowers the plane by a tenth of a photographer's height on one scene.
+
+    Args:
+        sparse: Points of SfM.
+        surface: Gives these and points from depth maps; called if it is needed.
+        centers: Camera centres.
+        tolerance: See `GroundConfig`.
+        seed: Seed of the plane search.
+
+    Returns:
+        See `find_ground`.
+    """
+    plane = find_ground(sparse, centers, tolerance, torch.Generator().manual_seed(seed))
+    if plane is None and len(points := surface()) > len(sparse):
+        return find_ground(points, centers, tolerance, torch.Generator().manual_seed(seed))
+    return plane
 
 
 def find_ground(
