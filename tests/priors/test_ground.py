@@ -61,16 +61,6 @@ def test_depth_maps_count_only_where_sfm_found_no_ground() -> None:
     assert ground_plane(wall(), wall, cameras(), 0.03) is None
 
 
-def test_the_ground_is_continued_at_the_height_of_the_points_of_sfm() -> None:
-    sparse = torch.cat([paving()[::4], wall()])
-    lower = paving() - torch.tensor([0.0, 0.0, 0.05])
-    points = torch.cat([sparse, lower])
-    alone, _ = ground_points(points, grey(points), cameras(), CONFIG)
-    filled, _ = ground_points(points, grey(points), cameras(), CONFIG, sparse=len(sparse))
-    assert float(alone[:, 2].median()) == pytest.approx(-0.55, abs=0.01)
-    assert float(filled[:, 2].median()) == pytest.approx(-0.5, abs=0.01)
-
-
 def test_the_hole_is_filled_and_what_is_known_is_not_doubled() -> None:
     known = paving()
     points = torch.cat([known, wall()])

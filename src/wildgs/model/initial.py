@@ -92,9 +92,7 @@ def initial_gaussians(
     centers = [view.camera.position for view in scene.train_views]
     no_points = (points[:0], colors[:0])
     ground = (
-        ground_points(points, colors, torch.stack(centers), wanted_ground, seed, sparse=len(sparse[0]))
-        if centers
-        else no_points
+        ground_points(points, colors, torch.stack(centers), wanted_ground, seed) if centers else no_points
     )
     names = [view.name for view in scene.train_views]
     return initial_from_points(replace(config, sky=sky), *sparse, dense=dense, ground=ground, photos=names)

@@ -38,7 +38,6 @@ def ground_points(
     centers: Float[Tensor, "V 3"],
     config: GroundConfig,
     seed: int = 0,
-    sparse: int | None = None,
 ) -> tuple[Float[Tensor, "G 3"], UInt8[Tensor, "G 3"]]:
     """Generates points that continue the ground plane where the scene has no points.
 
@@ -48,7 +47,6 @@ def ground_points(
         centers: Camera centres.
         config: Number, spacing and extent of the new points.
         seed: Seed of the plane search.
-        sparse: How many of the first points are from SfM; None for all. See `ground_plane`.
 
     Returns:
         Positions and colours of the new points. Empty if no ground plane is found.
@@ -56,7 +54,7 @@ def ground_points(
     nothing = points[:0], colors[:0]
     if config.points == 0 or len(centers) == 0:
         return nothing
-    plane = ground_plane(points[:sparse], lambda: points, centers, config.tolerance, seed)
+    plane = find_ground(points, centers, config.tolerance, torch.Generator().manual_seed(seed))
     if plane is None:
         return nothing
     members = _members(points, plane[None], config.tolerance)[0]
@@ -95,7 +93,6 @@ def ground_plane(
     surface: Callable[[], Float[Tensor, "Q 3"]],
     centers: Float[Tensor, "V 3"],
     tolerance: float,
-    seed: int = 0,
 ) -> Float[Tensor, "3"] | None:
     """Finds the ground by the points of SfM, or by further points where those are too few.
 
@@ -107,14 +104,13 @@ def ground_plane(
         surface: Gives these and points from depth maps; called if it is needed.
         centers: Camera centres.
         tolerance: See `GroundConfig`.
-        seed: Seed of the plane search.
 
     Returns:
         See `find_ground`.
     """
-    plane = find_ground(sparse, centers, tolerance, torch.Generator().manual_seed(seed))
+    plane = find_ground(sparse, centers, tolerance, torch.Generator().manual_seed(0))
     if plane is None and len(points := surface()) > len(sparse):
-        return find_ground(points, centers, tolerance, torch.Generator().manual_seed(seed))
+        return find_ground(points, centers, tolerance, torch.Generator().manual_seed(0))
     return plane
 
 
