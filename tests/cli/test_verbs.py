@@ -158,14 +158,16 @@ def test_help_as_a_subprocess_is_instant_and_loads_no_torch() -> None:
     assert time.monotonic() - start < 5
 
 
-def test_a_reader_who_leaves_early_sees_no_traceback() -> None:
-    code = "from wildgs.cli import main; main(['demo', '--help'])"
+@pytest.mark.parametrize("arguments", ["'demo', '--help'", "'--version'", "'doctor'"])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_who_leaves_early_sees_no_traceback(arguments: str, unbuffered: str) -> None:
+    code = f"from wildgs.cli import main; main([{arguments}])"
     reader, writer = os.pipe()
     os.close(reader)
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     with os.fdopen(writer, "w") as pipe:
-        result = subprocess.run(
-            [sys.executable, "-c", code], stdout=pipe, stderr=subprocess.PIPE, text=True, check=False
-        )
+        command = [sys.executable, "-c", code]
+        result = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, env=environment)
     assert (result.returncode, result.stderr) == (141, "")
 
 

@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
             with contextlib.suppress(OSError):
                 stream.reconfigure(errors="backslashreplace")
     try:
-        _dispatch(arguments)
+        _dispatch_and_flush(arguments)
     except ReportedError:
         sys.exit(USER_ERROR)
     except UserError as error:
@@ -70,6 +70,27 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
     finally:
         _flush_streams()
+
+
+def _dispatch_and_flush(arguments: list[str]) -> None:
+    """Runs a verb and writes its buffered output, so that a closed pipe is noticed even if the output is short."""
+    try:
+        _dispatch(arguments)
+    except SystemExit as end:
+        if not end.code:
+            _flush_stdout()
+        raise
+    _flush_stdout()
+
+
+def _flush_stdout() -> None:
+    """Flushes stdout; raises only if its reader has closed it."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError):
+        pass  # discarded by `_flush_streams`
 
 
 def _dispatch(arguments: list[str]) -> None:

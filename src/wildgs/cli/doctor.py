@@ -48,11 +48,12 @@ def run(command: Command) -> None:
 
 
 def _print_table(checks: list[Check]) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(markup=False, emoji=False, highlight=False)
+    from wildgs.cli.screen import PipedConsole
+
+    console = PipedConsole(markup=False, emoji=False, highlight=False)
     table = Table("", "", "", show_header=False, box=None, padding=(0, 2, 0, 0))
     colors = {"works": "green", "missing": "yellow", "broken": "red"}
     for check in checks:

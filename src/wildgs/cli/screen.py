@@ -91,6 +91,14 @@ class SafeStream:
         return getattr(self._stream, name)
 
 
+class PipedConsole(Console):
+    """A console whose closed pipe `wildgs.cli.main` reports, as that of all other output."""
+
+    def on_broken_pipe(self) -> None:
+        """Continues with the error that was raised, where rich would exit with code 1."""
+        raise BrokenPipeError
+
+
 OUT, ERR = SafeStream("stdout"), SafeStream("stderr")
 
 # No markup: names of files and photos may contain square brackets.
