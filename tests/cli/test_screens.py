@@ -40,7 +40,11 @@ def test_output_on_a_full_disk(forking_python: Path, landmark: Path, tmp_path: P
     assert trained_steps(tmp_path / "run") == 30
 
 
-def test_a_reader_that_leaves(landmark: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_leaves(
+    landmark: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unbuffered: str
+) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     process = start(landmark, tmp_path / "run", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None

@@ -164,7 +164,7 @@ def _stdout_is_closed() -> bool:
     try:
         print(flush=True)
     except BrokenPipeError:
-        _discard_output(sys.stdout)
+        discard_output(sys.stdout)
         return True
     return False
 
@@ -175,11 +175,12 @@ def _flush_streams() -> None:
         try:
             stream.flush()
         except (OSError, ValueError):
-            _discard_output(stream)
+            discard_output(stream)
 
 
-def _discard_output(stream: Any) -> None:
-    with contextlib.suppress(OSError, ValueError):
+def discard_output(stream: Any) -> None:
+    """Discards what is left in a stream's buffer, and all further output to it."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

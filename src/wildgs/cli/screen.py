@@ -22,6 +22,7 @@ from rich.progress import (
 from rich.table import Table
 
 from wildgs import processes
+from wildgs.cli import discard_output
 
 if TYPE_CHECKING:
     from wildgs.engine.report import StepReport
@@ -68,6 +69,9 @@ class SafeStream:
                 return self._stream.write(text)
             except UnicodeEncodeError:  # file names need not be valid UTF-8
                 return self._stream.write(text.encode("ascii", "backslashreplace").decode("ascii"))
+        except BrokenPipeError:
+            discard_output(self._stream)
+            return len(text)
         except (OSError, ValueError, RuntimeError, AttributeError):  # full disk, closed, reentered, no stream
             return len(text)
 
@@ -75,6 +79,8 @@ class SafeStream:
         """Flushes the stream if possible."""
         try:
             self._stream.flush()
+        except BrokenPipeError:
+            discard_output(self._stream)
         except (OSError, ValueError, RuntimeError, AttributeError):
             return
 
