@@ -18,6 +18,7 @@ from wildgs.priors.depth_points import known_depth
 from wildgs.priors.sky_pixels import find_sky_pixels
 from wildgs.scene import View
 from wildgs.scene.image_cache import AHEAD
+from wildgs.scene.scene import converted
 
 
 class ViewSampler:
@@ -150,7 +151,7 @@ class PhotoFeed:
         pixels = self._kept.get("photo", view.name, view.read_photo)
         mask = self._kept.get("mask", view.name, view.read_mask)
         assert pixels is not None
-        return pixels.float() / 255, None if mask is None else mask > 0
+        return converted(pixels, mask)
 
     def disparity(self, view: View) -> Float[Tensor, "H W"] | None:
         """The disparity map of the photo, if there is one."""

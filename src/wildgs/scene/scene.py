@@ -138,13 +138,20 @@ class View:
     def load(self, device: torch.device) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
         """The photo on a device: RGB in [0, 1], and the mask of pixels to use (False = ignore; None = all)."""
         mask = self.read_mask()
-        keep = None if mask is None else upload(mask, device) > 0
-        return to_unit(self.read_photo(), device), keep
+        mask = None if mask is None else upload(mask, device)
+        return converted(upload(self.read_photo(), device), mask)
+
+
+def converted(
+    pixels: UInt8[Tensor, "H W 3"], mask: UInt8[Tensor, "H W"] | None
+) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"] | None]:
+    """Converts a photo and its mask (see `View.read_mask`) on their device to the result of `View.load`."""
+    return pixels.float() / 255, None if mask is None else mask > 0
 
 
 def to_unit(pixels: UInt8[Tensor, "H W 3"], device: torch.device) -> Float[Tensor, "H W 3"]:
     """Converts 8-bit RGB to floats in [0, 1] on a device."""
-    return upload(pixels, device).float() / 255
+    return converted(upload(pixels, device), None)[0]
 
 
 @dataclass(frozen=True)
