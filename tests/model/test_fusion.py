@@ -97,6 +97,37 @@ def test_regions_in_order_have_the_harmonics_of_gaussians_in_any_order(apart: bo
     torch.testing.assert_close(ordered, torch.cat([unordered[~which], unordered[which]]))
 
 
+@pytest.mark.parametrize("apart", [True, False])
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("codes", [0, 3])
+def test_some_of_all_rows_have_the_values_and_gradients_of_regions(
+    apart: bool, shared: bool, codes: int
+) -> None:
+    torch.manual_seed(0)
+    fusion = Fusion(FusionConfig(), 16, 16)
+    if apart:
+        fusion.separate_sky()
+    common, local = torch.randn(16), torch.randn(16).expand(30, -1)
+    local = local if shared else torch.randn(30, 16)
+    rows, landmark = torch.randperm(40)[:30], 22
+    features, weight = fusion.initial_intrinsic(torch.rand(40, 3)), torch.randn(codes, 32)
+    results = []
+    for taken in (False, True):
+        intrinsic, matrix = features.clone().requires_grad_(), weight.clone().requires_grad_()
+        fusion.zero_grad()
+        if taken:
+            sh, found = fusion.of_rows(common, local, intrinsic, rows, landmark, matrix)
+        else:
+            below, above = intrinsic[rows[:landmark]], intrinsic[rows[landmark:]]
+            sh, found = fusion.by_region(common, local, below, above), below @ matrix.T
+        (sh.square().sum() + found.square().sum()).backward()
+        parameters = [p.grad.clone() for p in fusion.parameters() if p.grad is not None]
+        found_gradient = matrix.grad if codes else matrix.detach()
+        results.append([sh.detach(), found.detach(), intrinsic.grad, found_gradient, *parameters])
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+
+
 def test_the_networks_of_landmark_and_sky_share_no_weights() -> None:
     torch.manual_seed(0)
     fusion = Fusion(FusionConfig(), 16, 16)

@@ -7,9 +7,7 @@ import torch
 from torch.nn import functional
 
 from wildgs.model import fusion_layers
-from wildgs.model.fusion_kernels import PART
-from wildgs.model.fusion_layers import PARTS, ChunkedLayers, FusedLayers, SplitLinear, layers_over_rows
-from wildgs.threads import kernels_limited
+from wildgs.model.fusion_layers import PARTS, ChunkedLayers, SplitLinear, layers_over_rows
 
 
 @pytest.mark.parametrize("count", [3, PARTS, 2 * PARTS + 5])
@@ -64,42 +62,6 @@ def test_chunks_have_the_value_and_gradients_of_plain_layers(
     results = [value_and_gradients(function, leaves) for function in (plain_layers, chunked)]
     for found, wanted in zip(*results, strict=True):
         torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2 * PART + 100])
-@pytest.mark.parametrize(
-    ("inputs", "hidden", "outputs"), [(32, 48, 12), (5, 20, 3), (33, 64, 48), (16, 16, 27)]
-)
-def test_kernels_have_the_value_and_gradients_of_plain_layers(
-    count: int, inputs: int, hidden: int, outputs: int
-):
-    leaves = layer_inputs(count, inputs, hidden, outputs)
-    for given in (leaves, leaves[:7]):
-
-        def fused(*given):
-            return FusedLayers.apply(*given, *([] if len(given) == 8 else [None]))
-
-        results = [value_and_gradients(function, given) for function in (fused, plain_layers)]
-        for found, wanted in zip(*results, strict=True):
-            scale = wanted.abs().max().clamp_min(1e-6) if wanted.numel() else 1.0
-            torch.testing.assert_close(found / scale, wanted / scale, atol=1e-5, rtol=0)
-
-
-def test_kernels_do_not_depend_on_the_number_of_threads():
-    leaves = layer_inputs(3 * PART + 7, 32, 48, 12)
-    results = []
-    for threads in (1, 3):
-        with kernels_limited(threads):
-            results.append(value_and_gradients(FusedLayers.apply, leaves))
-    assert all(torch.equal(one, three) for one, three in zip(*results, strict=True))
-
-
-@pytest.mark.parametrize("place", range(8))
-def test_kernels_do_not_hide_what_is_not_finite(place: int):
-    """Steps with non-finite values are skipped, which needs them to arrive at the loss."""
-    leaves = layer_inputs(4, 32, 48, 12)
-    leaves[place].view(-1)[0] = torch.nan
-    assert FusedLayers.apply(*leaves).isnan().any()
 
 
 @pytest.mark.parametrize(

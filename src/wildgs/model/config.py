@@ -103,7 +103,7 @@ class FusionConfig:
     """
 
     intrinsic_size: int = 32
-    hidden: int = 48
+    hidden: int = 32
     sh_degree: int = 1
     output_scale: float = 0.1
     color_transform: bool = True

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
 from wildgs.model.config import FusionConfig
+from wildgs.model.fused_layers import fused_layers
 from wildgs.model.fusion_layers import layers_over_rows, linear_over_rows
+from wildgs.model.gaussians import take_rows
 from wildgs.model.precision import MixedModule
+from wildgs.rasterize.cpu.simd import has_avx512
 
 
 class Fusion(MixedModule):
@@ -72,20 +75,11 @@ class Fusion(MixedModule):
             intrinsic: f^in.
             color_map: Another colour transform [A | b], applied after the predicted one.
         """
-        output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         if not intrinsic.is_cuda and _is_shared(local_embeddings):
-            fused = layers_over_rows(
-                intrinsic,
-                self.first_rows.weight[:, local_embeddings.shape[1] :],
-                self._first_bias(global_embedding, local_embeddings[0]),
-                self.second.weight,
-                self.second.bias,
-                output,
-                bias,
-                direct,
-                precision=self.precision,
-            )
+            weights = self._layers(global_embedding, local_embeddings[0], color_map)
+            fused = layers_over_rows(intrinsic, *weights, precision=self.precision)
             return fused.reshape(-1, self.coefficients, 3)
+        output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
         with self.mixed(intrinsic.device):
             hidden = self._first_layer(global_embedding, local_embeddings, intrinsic).relu_()
             hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
@@ -117,6 +111,38 @@ class Fusion(MixedModule):
             return below
         return torch.cat([below, self.sky(global_embedding, _no_local(sky), sky)])
 
+    def of_rows(
+        self,
+        global_embedding: Float[Tensor, " G"],
+        local_embeddings: Float[Tensor, "V L"],
+        intrinsic: Float[Tensor, "N I"],
+        rows: Int[Tensor, " V"],
+        landmark: int,
+        codes: Float[Tensor, "C I"],
+    ) -> tuple[Float[Tensor, "V K 3"], Float[Tensor, "A C"]]:
+        """`by_region` of some of all Gaussians, and a linear function of the features of the landmark's.
+
+        Args:
+            global_embedding: Emb^g.
+            local_embeddings: Emb^l of the rows.
+            intrinsic: f^in of all Gaussians.
+            rows: Indices of the landmark's Gaussians, followed by those of the sky's.
+            landmark: Number of the former, A.
+            codes: Weights of the linear function; C may be 0.
+        """
+        if intrinsic.is_cuda or not _is_shared(local_embeddings) or not has_avx512():
+            below, above = take_rows(intrinsic, rows).split([landmark, len(rows) - landmark])
+            harmonics = self.by_region(global_embedding, local_embeddings, below, above)
+            return harmonics, functional.linear(below, codes)
+        weights = self._layers(global_embedding, local_embeddings[0])
+        regions = [(rows[:landmark], (*weights, codes if len(codes) else None))]
+        if landmark < len(rows):
+            if self.sky is not None:
+                weights = self.sky._layers(global_embedding, local_embeddings[0, :0])
+            regions.append((rows[landmark:], (*weights, None)))
+        harmonics, found = fused_layers(intrinsic, regions)
+        return harmonics.reshape(-1, self.coefficients, 3), found.reshape(landmark, len(codes))
+
     def with_sky(
         self,
         global_embedding: Float[Tensor, " G"],
@@ -140,6 +166,18 @@ class Fusion(MixedModule):
         rows = which.nonzero()[:, 0]
         above = intrinsic[rows]
         return harmonics.index_copy(0, rows, self.sky(global_embedding, _no_local(above), above, color_map))
+
+    def _layers(
+        self,
+        global_embedding: Float[Tensor, " G"],
+        local_embedding: Float[Tensor, " L"],
+        color_map: Float[Tensor, "3 4"] | None = None,
+    ) -> tuple[Tensor | None, ...]:
+        """Weights of the layers where both embeddings are the same for all Gaussians, for `layers_over_rows`."""
+        output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
+        first = self.first_rows.weight[:, len(local_embedding) :]
+        first_bias = self._first_bias(global_embedding, local_embedding)
+        return first, first_bias, self.second.weight, self.second.bias, output, bias, direct
 
     def _first_layer(
         self,

@@ -157,7 +157,7 @@ def read_rows(source, width, first, count, out, padded):
 
 @njit(nogil=True)
 def write_rows(source, padded, out, width, first, count):
-    """The other way round."""
+    """The inverse of `read_rows`."""
     if padded == width:
         out[first * width : (first + count) * width] = source[: count * width]
     elif width == 12:
@@ -171,6 +171,40 @@ def write_rows(source, padded, out, width, first, count):
 
 
 @njit(nogil=True)
+def copy_row(source, at, out, to, width):
+    """``out[to : to + width] = source[at : at + width]``."""
+    k = 0
+    while width - k >= LANES:
+        vstore(out, to + k, vload(source, at + k))
+        k += LANES
+    while k < width:
+        out[to + k] = source[at + k]
+        k += 1
+
+
+@njit(nogil=True)
+def gather_rows(source, width, index, first, count, out, padded):
+    """Like `read_rows` for the rows that `index` names; an empty one names all."""
+    if index.size == 0:
+        read_rows(source, width, first, count, out, padded)
+        return
+    if count < CHUNK or padded > width:
+        out[:] = 0.0
+    for r in range(count):
+        copy_row(source, index[first + r] * width, out, r * padded, width)
+
+
+@njit(nogil=True)
+def scatter_rows(source, padded, out, width, index, first, count):
+    """The inverse of `gather_rows`."""
+    if index.size == 0:
+        write_rows(source, padded, out, width, first, count)
+        return
+    for r in range(count):
+        copy_row(source, r * padded, out, index[first + r] * width, width)
+
+
+@njit(nogil=True)
 def hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bias, one, two, hidden):
     """The activations of both hidden layers for a chunk, into `one` and `two`."""
     layer(x, padded_inputs, inputs, first, first_bias, one, hidden)
@@ -180,40 +214,48 @@ def hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bi
 
 
 @njit(nogil=True)
-def layers_forward(counter, rows, inputs, padded_inputs, hidden, outputs, padded_outputs,
-                   first, first_bias, second, second_bias, last, last_bias, direct, out):  # fmt: skip
-    """See `fusion_layers.FusedLayers`. Weights are transposed, [inputs, outputs]; `direct` is empty without D."""
-    n = rows.size // inputs
+def layers_forward(counter, n, rows, index,
+                   inputs, padded_inputs, hidden, outputs, padded_outputs, codes, padded_codes,
+                   first, first_bias, second, second_bias, last, last_bias, direct, code_weights, zeros,
+                   out, out_codes):  # fmt: skip
+    """See `fused_layers.FusedLayers`, for the n rows of one region.
+
+    Weights are transposed, [inputs, outputs]; `direct` is empty without D, `code_weights` without C.
+    """
     x, one = aligned(CHUNK * padded_inputs), aligned(CHUNK * hidden)
     two, y = aligned(CHUNK * hidden), aligned(CHUNK * padded_outputs)
+    z = aligned(CHUNK * padded_codes)
     while True:
         begin = fetch_add(counter, 1) * PART
         if begin >= n:
             break
         for at in range(begin, min(begin + PART, n), CHUNK):
             count = min(CHUNK, n - at)
-            read_rows(rows, inputs, at, count, x, padded_inputs)
+            gather_rows(rows, inputs, index, at, count, x, padded_inputs)
             hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bias, one, two, hidden)
             layer(two, hidden, hidden, last, last_bias, y, padded_outputs)
             if direct.size > 0:
                 add_layer(x, padded_inputs, inputs, direct, y, padded_outputs)
             write_rows(y, padded_outputs, out, outputs, at, count)
+            if code_weights.size > 0:
+                layer(x, padded_inputs, inputs, code_weights, zeros, z, padded_codes)
+                write_rows(z, padded_codes, out_codes, codes, at, count)
 
 
 @njit(nogil=True)
-def layers_backward(counter, rows, gradient, inputs, padded_inputs, hidden, outputs, padded_outputs,
+def layers_backward(counter, n, rows, index, gradient, code_gradient,
+                    inputs, padded_inputs, hidden, outputs, padded_outputs, codes, padded_codes,
                     first, first_bias, second, second_bias, first_back, second_back, last_back, direct_back,
-                    zeros, by_rows, sums):  # fmt: skip
+                    code_back, zeros, by_rows, sums):  # fmt: skip
     """The gradients of `layers_forward`.
 
     Weights whose names end in `_back` are [outputs, inputs]. `sums` has a row per work item: the gradients of W1,
-    b1, W2, b2, W3, b3 and D, one after the other, padded; a work item is computed by one thread, in order.
+    b1, W2, b2, W3, b3, D and C, one after the other, padded; a work item is computed by one thread, in order.
     """
-    n = rows.size // inputs
     x, one = aligned(CHUNK * padded_inputs), aligned(CHUNK * hidden)
     two, y = aligned(CHUNK * hidden), aligned(CHUNK * padded_outputs)
     of_one, of_two = aligned(CHUNK * hidden), aligned(CHUNK * hidden)
-    of_x = aligned(CHUNK * padded_inputs)
+    of_x, z = aligned(CHUNK * padded_inputs), aligned(CHUNK * padded_codes)
     while True:
         item = fetch_add(counter, 1)
         begin = item * PART
@@ -235,9 +277,11 @@ def layers_backward(counter, rows, gradient, inputs, padded_inputs, hidden, outp
         by_last_bias = total[to : to + padded_outputs]
         to += padded_outputs
         by_direct = total[to : to + padded_outputs * padded_inputs]
+        to += by_direct.size
+        by_codes = total[to : to + padded_codes * padded_inputs]
         for at in range(begin, min(begin + PART, n), CHUNK):
             count = min(CHUNK, n - at)
-            read_rows(rows, inputs, at, count, x, padded_inputs)
+            gather_rows(rows, inputs, index, at, count, x, padded_inputs)
             read_rows(gradient, outputs, at, count, y, padded_outputs)
             hidden_layers(x, padded_inputs, inputs, first, first_bias, second, second_bias, one, two, hidden)
             layer(y, padded_outputs, outputs, last_back, zeros, of_two, hidden)
@@ -248,10 +292,14 @@ def layers_backward(counter, rows, gradient, inputs, padded_inputs, hidden, outp
             if direct_back.size > 0:
                 add_layer(y, padded_outputs, outputs, direct_back, of_x, padded_inputs)
                 add_outer(y, padded_outputs, x, padded_inputs, by_direct)
+            if code_back.size > 0:
+                read_rows(code_gradient, codes, at, count, z, padded_codes)
+                add_layer(z, padded_codes, codes, code_back, of_x, padded_inputs)
+                add_outer(z, padded_codes, x, padded_inputs, by_codes)
             add_outer(of_one, hidden, x, padded_inputs, by_first)
             add_rows(of_one, hidden, by_first_bias)
             add_outer(of_two, hidden, one, hidden, by_second)
             add_rows(of_two, hidden, by_second_bias)
             add_outer(y, padded_outputs, two, hidden, by_last)
             add_rows(y, padded_outputs, by_last_bias)
-            write_rows(of_x, padded_inputs, by_rows, inputs, at, count)
+            scatter_rows(of_x, padded_inputs, by_rows, inputs, index, at, count)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from wildgs import features
-from wildgs.model import fusion_kernels
-from wildgs.rasterize.cpu.simd import LANES, has_avx512
-from wildgs.threads import flat, launch
+from wildgs.model.fused_layers import fused_layers
+from wildgs.rasterize.cpu.simd import has_avx512
 
 PARTS = 128
 LEAST_ROWS = 64 * PARTS
@@ -27,7 +25,7 @@ def layers_over_rows(
 ) -> Float[Tensor, "N O"]:
     """The layers on the CPU by the faster implementation; weights as those of `ChunkedLayers`."""
     if has_avx512():
-        return FusedLayers.apply(rows, *weights)
+        return fused_layers(rows, [(None, (*weights, None))])[0]
     return ChunkedLayers.apply(rows, *weights, precision)
 
 
@@ -135,85 +133,3 @@ class ChunkedLayers(torch.autograd.Function):
 def _chunks(count: int) -> list[slice]:
     """Slices of at most `CHUNK` rows."""
     return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
-
-
-class FusedLayers(torch.autograd.Function):
-    """The layers of `ChunkedLayers` by kernels of their own, in float32, for processors with AVX-512.
-
-    The products of a fusion network are narrow (48 columns). Libraries take as long to arrange their operands as to
-    compute them, and are slowest at gradients of weights, which are sums over all Gaussians. Results do not
-    depend on the number of threads.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        rows: Float[Tensor, "N I"],
-        first: Float[Tensor, "H I"],
-        first_bias: Float[Tensor, " H"],
-        second: Float[Tensor, "H H"],
-        second_bias: Float[Tensor, " H"],
-        last: Float[Tensor, "O H"],
-        last_bias: Float[Tensor, " O"],
-        direct: Float[Tensor, "O I"] | None,
-    ) -> Float[Tensor, "N O"]:
-        """Computes the layers; see `ChunkedLayers`."""
-        out = rows.new_empty(len(rows), len(last))
-        ctx.sizes = (rows.shape[1], len(first), len(last))
-        inputs, hidden, outputs = ctx.padded = tuple(-(-size // LANES) * LANES for size in ctx.sizes)
-        ctx.hidden_layers = (
-            _padded(first.T, hidden), _padded(first_bias[None], hidden),
-            _padded(second.T, hidden, hidden), _padded(second_bias[None], hidden),
-        )  # fmt: skip
-        launch(
-            fusion_kernels.layers_forward,
-            flat(rows), rows.shape[1], inputs, hidden, len(last), outputs,
-            *ctx.hidden_layers, _padded(last.T, outputs, hidden), _padded(last_bias[None], outputs),
-            _NONE if direct is None else _padded(direct.T, outputs), flat(out),
-            items=-(-len(rows) // fusion_kernels.PART),
-        )  # fmt: skip
-        ctx.save_for_backward(rows, first, second, last, direct)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of rows, weights and biases."""
-        rows, first, second, last, direct = ctx.saved_tensors
-        inputs, hidden, outputs = ctx.padded
-        by_rows = torch.empty_like(rows)
-        hidden_shapes = ((hidden, inputs), (1, hidden), (hidden, hidden), (1, hidden))
-        shapes = (*hidden_shapes, (outputs, hidden), (1, outputs), (outputs, inputs))
-        sizes = [height * width for height, width in shapes]
-        items = -(-len(rows) // fusion_kernels.PART)
-        sums = np.empty((items, sum(sizes)), np.float32)
-        launch(
-            fusion_kernels.layers_backward,
-            flat(rows), flat(gradients[0]), rows.shape[1], inputs, hidden, len(last), outputs,
-            *ctx.hidden_layers,
-            _padded(first, inputs, hidden), _padded(second, hidden, hidden), _padded(last, hidden),
-            _NONE if direct is None else _padded(direct, inputs), np.zeros(max(inputs, hidden), np.float32),
-            flat(by_rows), sums,
-            items=items,
-        )  # fmt: skip
-        parts = torch.from_numpy(sums.sum(0)).split(sizes)
-        found = [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
-        like = (first, first[:, 0], second, second[:, 0], last, last[:, 0], direct)
-        cut = [None if each is None else _cut(part, each) for part, each in zip(found, like, strict=True)]
-        return by_rows, *cut
-
-
-_NONE = np.empty(0, np.float32)
-
-
-def _padded(matrix: Float[Tensor, "R C"], columns: int, rows: int = 0) -> Float[np.ndarray, " _"]:
-    """A matrix with zeros added on the right and below, as kernels take it."""
-    out = matrix.new_zeros(max(rows, len(matrix)), columns)
-    out[: len(matrix), : matrix.shape[1]] = matrix.detach()
-    return flat(out)
-
-
-def _cut(padded: Float[Tensor, "R C"], like: Tensor) -> Tensor:
-    """Undoes `_padded`, for a matrix or a bias."""
-    if like.ndim == 1:
-        return padded[0, : len(like)]
-    return padded[: len(like), : like.shape[1]]

@@ -120,6 +120,13 @@ class PhotoMatch(nn.Module):
         """Number of columns of a transform: [A | b] and light codes of the landmark, and those of the sky."""
         return 4 + self.num_codes + (SKY_COLUMNS if self.config.sky.points else 0)
 
+    @property
+    def code_weights(self) -> Float[Tensor, "L I"]:
+        """The matrix from an intrinsic feature to light codes."""
+        if self.codes is None:
+            return torch.empty(0, self.config.fusion.intrinsic_size)
+        return self.codes.weight
+
     def light_codes(self, intrinsic: Float[Tensor, "N I"]) -> Float[Tensor, "N L"]:
         """Light codes of the Gaussians, by which their transforms vary."""
         return intrinsic[:, :0] if self.codes is None else self.codes(intrinsic)
@@ -183,7 +190,7 @@ class PhotoMatch(nn.Module):
     def matched(
         self,
         colors: Float[Tensor, "V 3"],
-        landmark: Float[Tensor, "A I"],
+        codes: Float[Tensor, "A L"],
         sky: Float[Tensor, "B 3"],
         rows: Int[Tensor, " V"],
         count: int,
@@ -194,14 +201,13 @@ class PhotoMatch(nn.Module):
 
         Args:
             colors: Colours of the landmark's Gaussians, followed by those of the sky.
-            landmark: Intrinsic features of the landmark's Gaussians.
+            codes: Light codes of the landmark's Gaussians.
             sky: Centres of the sky's Gaussians.
             rows: Indices of the Gaussians.
             count: Number of all Gaussians.
             sight: The photo.
             centre: Centre of the scene.
         """
-        codes = self.light_codes(landmark)
         with torch.no_grad():
             values = torch.cat([colors, functional.pad(codes, (0, 0, 0, len(sky)))], dim=1)
             values = spread_rows(values, rows, count)

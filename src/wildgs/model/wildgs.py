@@ -356,19 +356,19 @@ class WildGS(Method):
             lifted = self._lifted_in_training(photo, keep)
             appearance = self.wrap(photo, appearance, projection, lifted, learn=stage.learn_planes)
         rows, landmark = self._rows_to_shade(projection.visible)
-        # Taken once: every further gather of a row has a scatter in the backward pass.
-        means, intrinsic = (take_rows(self.gaussians.rows[name], rows) for name in ("means", "intrinsic"))
-        regions = intrinsic.split([landmark, len(rows) - landmark])
+        means = take_rows(self.gaussians.means, rows)
         assert appearance.global_embedding is not None
         local = self.wrapping.local_embeddings(appearance.planes, means)
-        inputs = [self._network_input(region) for region in regions]
-        harmonics = self.fusion.by_region(appearance.global_embedding, local, *inputs)
+        intrinsic = self._network_input(self.gaussians.rows["intrinsic"])
+        harmonics, codes = self.fusion.of_rows(
+            appearance.global_embedding, local, intrinsic, rows, landmark, self.photo_match.code_weights
+        )
         matched = bool(self.config.color_match and self.config.matched_loss)
         colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
         sight = Sight(photo, projection, appearance.visibility, keep)
         if matched:
             colors = self.photo_match.matched(
-                colors, regions[0], means[landmark:], rows, self.num_gaussians, sight, self._centre
+                colors, codes, means[landmark:], rows, self.num_gaussians, sight, self._centre
             ).clamp_min(0)
         colors = spread_rows(colors, rows, self.num_gaussians)
         rendering = blend(projection, colors)
