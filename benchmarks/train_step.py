@@ -61,7 +61,7 @@ FORWARD_STAGES = (
     ("rasterise (wildgs)", "wildgs.model.wildgs.blend"),
     ("rasterise (3dgs)", "wildgs.model.method.blend"),
     ("colour match", "wildgs.model.photo_match.match_photo"),
-    ("losses", "wildgs.engine.trainer.total_loss"),
+    ("losses", "wildgs.engine.loss_replay.LossReplays.__call__"),
     ("optimiser", "wildgs.engine.optimizers.Optimizers.step"),
     ("densification statistics", "wildgs.engine.density.DensityControl.gather"),
 )

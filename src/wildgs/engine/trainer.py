@@ -18,6 +18,7 @@ from wildgs.engine.consensus import Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.flat_ground import FlatGround
+from wildgs.engine.loss_replay import LossReplays
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.photo_counts import PhotoCounts
 from wildgs.engine.process_settings import ProcessSettings
@@ -26,7 +27,7 @@ from wildgs.engine.safety import StepGuard
 from wildgs.engine.schedule import Schedule
 from wildgs.engine.team import Team, same_everywhere
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.losses.objective import Losses, total_loss
+from wildgs.losses.objective import Losses
 from wildgs.model.method import Method
 from wildgs.model.parsing import FeatureCache, keep_features
 from wildgs.model.precision import (
@@ -106,6 +107,7 @@ class Trainer:
         self.flat_ground = FlatGround(method, scene, config.flat_ground)
         self.photo_counts = PhotoCounts(method, config.dropout, config.steps, needed=self.flat_ground.is_used)
         self.guard = StepGuard()
+        self.loss = LossReplays()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
         self._process = ProcessSettings(self.device)
         self.on_final_photo: Counter = lambda done, total: None
@@ -146,12 +148,14 @@ class Trainer:
         self.team.share(self.method.state_dict().values())
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
+        self.loss.switch(self.cuda_graphs)
         keep_features(self.method, FeatureCache(self.feature_cache))
 
     def end(self) -> None:
         """Undoes `begin`: float32, no CUDA graphs, and the previous settings of the process."""
         set_precision(self.method, torch.float32)
         switch_replays(self.method, False)
+        self.loss.switch(False)
         keep_features(self.method, None)
         self._process.end()
 
@@ -262,7 +266,7 @@ class Trainer:
         stage = replace(stage, dropout=rates, neighbours=neighbours, absgrad=self.density.absgrad)
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
-        losses = total_loss(
+        losses = self.loss(
             self.config.objective,
             self.schedule.mask_progress(self.step),
             photo,

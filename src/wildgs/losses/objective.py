@@ -91,15 +91,68 @@ def total_loss(
     Returns:
         All terms.
     """
-    if visibility is not None and not train_mask:
-        visibility = visibility.detach()
-    proven = None if observations is None else proven_static(observations, *photo.shape[:2])
+    return weighted_losses(
+        config,
+        photo,
+        render,
+        config.mask_weight(progress, num_photos),
+        sky_depth,
+        visibility=visibility if train_mask or visibility is None else visibility.detach(),
+        keep=keep,
+        depth=depth,
+        alpha=alpha,
+        disparity=disparity,
+        metric_depth=metric_depth,
+        sky=sky,
+        proven=None if observations is None else proven_static(observations, *photo.shape[:2]),
+        mask_threshold=mask_threshold,
+        doubt=doubt,
+    )
+
+
+def weighted_losses(
+    config: ObjectiveConfig,
+    photo: Float[Tensor, "H W 3"],
+    render: Float[Tensor, "H W 3"],
+    mask_weight: float | Float[Tensor, ""],
+    sky_depth: float | Float[Tensor, ""],
+    *,
+    visibility: Float[Tensor, "H W"] | None = None,
+    keep: Bool[Tensor, "H W"] | None = None,
+    depth: Float[Tensor, "H W"] | None = None,
+    alpha: Float[Tensor, "H W"] | None = None,
+    disparity: Float[Tensor, "H W"] | None = None,
+    metric_depth: Float[Tensor, "H W"] | None = None,
+    sky: Bool[Tensor, "H W"] | None = None,
+    proven: Bool[Tensor, "H W"] | None = None,
+    mask_threshold: float = 0.5,
+    doubt: Float[Tensor, "_ _"] | None = None,
+) -> Losses:
+    """`total_loss` where all that changes from step to step is a tensor, for CUDA graphs.
+
+    Args:
+        config: Weights.
+        photo: I.
+        render: Î.
+        mask_weight: λ^M.
+        sky_depth: As in `total_loss`, like all arguments without another remark.
+        visibility: Predicted mask M, detached if it does not learn.
+        keep: The user's mask.
+        depth: Rendered expected depth.
+        alpha: Accumulated alpha.
+        disparity: Monocular estimate.
+        metric_depth: Depth in world units.
+        sky: Pixels that certainly show sky.
+        proven: Pixels known to be static (`proven_static`).
+        mask_threshold: Threshold Th.
+        doubt: Degree to which pixels may be transient.
+    """
     image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven, doubt)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
         mask = visibility_regularizer(visibility if keep is None else torch.where(keep, visibility, 1.0))
-        total = total + config.mask_weight(progress, num_photos) * mask
+        total = total + mask_weight * mask
     if depth is not None and (disparity is not None or metric_depth is not None):
         selection = torch.ones_like(depth, dtype=torch.bool) if keep is None else keep
         if visibility is not None:
@@ -155,7 +208,9 @@ def visibility_regularizer(visibility: Float[Tensor, "H W"]) -> Float[Tensor, ""
     return (1 - visibility).square().mean()
 
 
-def nearness(depth: Float[Tensor, "H W"], sky: Bool[Tensor, "H W"], far: float) -> Float[Tensor, ""]:
+def nearness(
+    depth: Float[Tensor, "H W"], sky: Bool[Tensor, "H W"], far: float | Float[Tensor, ""]
+) -> Float[Tensor, ""]:
     """Mean over all pixels of ``1 - depth / far`` where the photo shows sky and the render is nearer than `far`.
 
     The rendered depth is that of the distant shell if nothing is in front of it.

@@ -173,8 +173,8 @@ class Recording:
                 backward()
         # Restores the current stream if the capture fails.
         with torch.cuda.stream(torch.cuda.current_stream()):
-            self._forward, outputs = _captured(forward, memory)
-            self._backward, self.gradients = _captured(backward, memory)
+            self._forward, outputs = captured(forward, memory)
+            self._backward, self.gradients = captured(backward, memory)
         self._outputs = [output.detach() for output in outputs]
         self._learning = [output.requires_grad for output in outputs]
 
@@ -235,7 +235,7 @@ class _Replay(torch.autograd.Function):
         )
 
 
-def _captured(function: Callable[[], Result], memory: Any) -> tuple[Any, Result]:
+def captured(function: Callable[[], Result], memory: Any) -> tuple[Any, Result]:
     """Captures a function; returns the CUDA graph and the function's result.
 
     Calls by other threads, which decode photos or write checkpoints, do not invalidate the capture.
@@ -263,7 +263,7 @@ def _record(part: _Part, x: Tensor, memory: Any) -> Recording:
     recording = Recording(part, x, memory)
     wanted = _values_and_gradients(part, x, recording.learnt)
     found = _values_and_gradients(recording, x, recording.learnt)
-    if not all(_alike(one, other) for one, other in zip(wanted, found, strict=True)):
+    if not all(alike(one, other) for one, other in zip(wanted, found, strict=True)):
         raise RuntimeError("results of a replay differ from eager execution")
     return recording
 
@@ -286,7 +286,7 @@ def _values_and_gradients(
     return copies[0], copies[1]
 
 
-def _alike(wanted: Values, found: Values) -> bool:
+def alike(wanted: Values, found: Values) -> bool:
     """Whether the same values are None and the others agree up to `TOLERANCE` in their joint norm."""
     if [value is None for value in wanted] != [value is None for value in found]:
         return False
