@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -75,14 +77,22 @@ class Fusion(MixedModule):
             intrinsic: f^in.
             color_map: Another colour transform [A | b], applied after the predicted one.
         """
-        if not intrinsic.is_cuda and _is_shared(local_embeddings):
+        rows = intrinsic
+        if _is_shared(local_embeddings):
             weights = self._layers(global_embedding, local_embeddings[0], color_map)
-            fused = layers_over_rows(intrinsic, *weights, precision=self.precision)
-            return fused.reshape(-1, self.coefficients, 3)
-        output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
+            if not intrinsic.is_cuda:
+                fused = layers_over_rows(intrinsic, *weights, precision=self.precision)
+                return fused.reshape(-1, self.coefficients, 3)
+            first, first_bias, second, second_bias, output, bias, direct = weights
+        else:
+            output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
+            first, first_bias = self.first_rows.weight, self.first_global(global_embedding)
+            second, second_bias = self.second.weight, self.second.bias
+            # Converted before concatenation, which would otherwise copy both in full precision.
+            rows = torch.cat([local_embeddings.to(self.precision), intrinsic.to(self.precision)], dim=1)
         with self.mixed(intrinsic.device):
-            hidden = self._first_layer(global_embedding, local_embeddings, intrinsic).relu_()
-            hidden = linear_over_rows(hidden, self.second.weight, self.second.bias).relu_()
+            hidden = linear_over_rows(rows.to(self.precision), first, first_bias).relu_()
+            hidden = linear_over_rows(hidden, second, second_bias).relu_()
             fused = linear_over_rows(hidden, output, bias)
         fused = fused.float()
         if direct is not None:  # in full precision, because it contains the base colour
@@ -172,35 +182,31 @@ class Fusion(MixedModule):
         global_embedding: Float[Tensor, " G"],
         local_embedding: Float[Tensor, " L"],
         color_map: Float[Tensor, "3 4"] | None = None,
-    ) -> tuple[Tensor | None, ...]:
-        """Weights of the layers where both embeddings are the same for all Gaussians, for `layers_over_rows`."""
-        output, direct, bias = self._last_layers(self._change(global_embedding, color_map))
-        first = self.first_rows.weight[:, len(local_embedding) :]
-        first_bias = self._first_bias(global_embedding, local_embedding)
+    ) -> tuple[Any, ...]:
+        """Weights of the layers where both embeddings are the same for all Gaussians, for `layers_over_rows`.
+
+        Some hundred small operations, forward and backward, which CUDA graphs replay.
+        """
+        embeddings, size = torch.cat([global_embedding, local_embedding]), len(local_embedding)
+        if color_map is None:
+            networks = [self.first_global, self.first_rows, self.output, self.direct, self.transform]
+            used = [network for network in networks if network is not None]
+            first, first_bias, *last = self.replays(self._weights, used, embeddings, (size,))
+        else:
+            first, first_bias, *last = self._weights(embeddings, size, color_map)
+        output, bias, direct = last if self.direct is not None else (*last, None)
         return first, first_bias, self.second.weight, self.second.bias, output, bias, direct
 
-    def _first_layer(
-        self,
-        global_embedding: Float[Tensor, " G"],
-        local_embeddings: Float[Tensor, "N L"],
-        intrinsic: Float[Tensor, "N I"],
-    ) -> Float[Tensor, "N H"]:
-        """The first layer before its ReLU."""
-        weight = self.first_rows.weight
-        intrinsic = intrinsic.to(self.precision)
-        if _is_shared(local_embeddings):
-            bias = self._first_bias(global_embedding, local_embeddings[0])
-            return linear_over_rows(intrinsic, weight[:, local_embeddings.shape[1] :], bias)
-        # Converted before concatenation, which would otherwise copy both in full precision.
-        rows = torch.cat([local_embeddings.to(self.precision), intrinsic], dim=1)
-        return linear_over_rows(rows, weight, self.first_global(global_embedding))
-
-    def _first_bias(
-        self, global_embedding: Float[Tensor, " G"], local_embedding: Float[Tensor, " L"]
-    ) -> Float[Tensor, " H"]:
-        """Contribution to the first layer of embeddings that are the same for all Gaussians."""
-        by_local = self.first_rows.weight[:, : len(local_embedding)]
-        return self.first_global(global_embedding) + functional.linear(local_embedding[None], by_local)[0]
+    def _weights(
+        self, embeddings: Float[Tensor, " E"], local_size: int, color_map: Float[Tensor, "3 4"] | None = None
+    ) -> tuple[Tensor, ...]:
+        """W1, b1, W3, b3 and D, unless it is None, for global and local embedding, concatenated."""
+        common, local = embeddings.tensor_split((len(embeddings) - local_size,))
+        by_local, first = self.first_rows.weight.tensor_split((local_size,), dim=1)
+        first_bias = self.first_global(common) + functional.linear(local[None], by_local)[0]
+        output, direct, bias = self._last_layers(self._change(common, color_map))
+        weights = (first.contiguous(), first_bias, output, bias)
+        return weights if direct is None else (*weights, direct)
 
     def _change(
         self, global_embedding: Float[Tensor, " G"], color_map: Float[Tensor, "3 4"] | None

@@ -34,13 +34,14 @@ def linear_over_rows(
 ) -> Float[Tensor, "N O"]:
     """``rows @ weight.T + bias``, one row per Gaussian, in the precision of the rows or of autocast."""
     if rows.is_cuda and len(rows) >= LEAST_ROWS and features.is_on("split_weights"):
-        return SplitLinear.apply(rows, weight.to(rows.dtype), bias.to(rows.dtype))
+        return SplitLinear.apply(rows, weight, bias)
     return functional.linear(rows, weight, bias)
 
 
 class SplitLinear(torch.autograd.Function):
-    """`torch.nn.functional.linear` whose weight gradient is summed in `PARTS` parts, for operands of one dtype.
+    """`torch.nn.functional.linear` whose weight gradient is summed in `PARTS` parts, in the dtype of the rows.
 
+    Gradients of weight and bias have the dtype of these.
     The gradient of a small weight matrix (64 x 48) is a reduction over all Gaussians. As one product it has a
     single output tile, which occupies few of a GPU's multiprocessors.
     """
@@ -48,8 +49,9 @@ class SplitLinear(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """Computes [N, O] from rows [N, I], weight [O, I] and bias [O]."""
+        ctx.dtype, weight = weight.dtype, weight.to(rows.dtype)
         ctx.save_for_backward(rows, weight)
-        return functional.linear(rows, weight, bias)
+        return functional.linear(rows, weight, bias.to(rows.dtype))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
@@ -62,9 +64,10 @@ class SplitLinear(torch.autograd.Function):
             gradient[:whole].view(PARTS, -1, weight.shape[0]),
             rows[:whole].view(PARTS, -1, weight.shape[1]),
         )
-        sums = torch.bmm(parts[0].transpose(1, 2), parts[1]).sum(0, dtype=torch.float32)
-        by_weight = sums + (gradient[whole:].T @ rows[whole:]).float()
-        return by_rows, by_weight.to(weight.dtype), gradient.sum(0)
+        by_weight = torch.bmm(parts[0].transpose(1, 2), parts[1]).sum(0, dtype=ctx.dtype)
+        if whole < len(rows):
+            by_weight = by_weight + gradient[whole:].T @ rows[whole:]
+        return by_rows, by_weight, gradient.sum(0, dtype=ctx.dtype)
 
 
 class ChunkedLayers(torch.autograd.Function):

@@ -86,12 +86,12 @@ class Replays:
             network: Function of one tensor that returns several. It must launch the same kernels for the same shape
                 and settings, must not synchronise, and must not use random numbers.
             modules: The modules that it calls.
-            x: Input without gradient.
+            x: Input.
             settings: Further arguments; each combination is captured separately.
         """
         if not self.records(x):
             return network(x, *settings)
-        key = (tuple(x.shape), *settings)
+        key = (tuple(x.shape), x.requires_grad, *settings)
         if key in self._graphs:
             return self._graphs[key](x)
         self._calls[key] = self._calls.get(key, 0) + 1
@@ -99,7 +99,7 @@ class Replays:
             return network(x, *settings)
         try:
             self._memory = self._memory or torch.cuda.graph_pool_handle()
-            self._graphs[key] = _record(_Part(network, modules, settings), x.detach(), self._memory)
+            self._graphs[key] = _record(_Part(network, modules, settings), x, self._memory)
         except RuntimeError as error:
             self.switch(False)
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -131,6 +131,7 @@ class Recording:
     Attributes:
         learnt: Parameters that get gradients.
         gradients: Their gradients, in the graphs' memory and the parameters' memory format; None for unused ones.
+        by_input: Gradient of the input, in the graphs' memory; None for an input without gradient.
     """
 
     def __init__(self, part: _Part, x: Tensor, memory: Any) -> None:
@@ -146,23 +147,26 @@ class Recording:
         """
         named = {name: p for name, p in part.named_parameters() if p.requires_grad}
         self.learnt = list(named.values())
-        self._x = x.clone()
+        self._x, learns_input = x.detach().clone(), x.requires_grad
         self._anchor = torch.zeros((), device=x.device, requires_grad=True)
         aliases: dict[str, Tensor] = {}
+        place: dict[str, Tensor] = {}
 
         def forward() -> Outputs:
             # Separate leaves that share the parameters' memory, because the parameters' gradient accumulators may
             # belong to an eager step and its stream, which would invalidate the capture. They are new in every
             # pass, because those of the warm-up belong to its stream.
             aliases.update({name: parameter.detach().requires_grad_() for name, parameter in named.items()})
-            return torch.func.functional_call(part, aliases, (self._x,))
+            place.update({"x": self._x.detach().requires_grad_(learns_input)})
+            return torch.func.functional_call(part, aliases, (place["x"],))
 
         def backward() -> Values:
             learning = [output for output in outputs if output.requires_grad]
-            found = torch.autograd.grad(learning, list(aliases.values()), self._incoming, allow_unused=True)
+            leaves = [*aliases.values(), *(place.values() if learns_input else ())]
+            found = torch.autograd.grad(learning, leaves, self._incoming, allow_unused=True)
             return [
-                None if gradient is None else _laid_out_as(alias, gradient)
-                for alias, gradient in zip(aliases.values(), found, strict=True)
+                None if gradient is None else _laid_out_as(leaf, gradient)
+                for leaf, gradient in zip(leaves, found, strict=True)
             ]
 
         torch.cuda.synchronize()
@@ -175,6 +179,7 @@ class Recording:
         with torch.cuda.stream(torch.cuda.current_stream()):
             self._forward, outputs = captured(forward, memory)
             self._backward, self.gradients = captured(backward, memory)
+        self.by_input = self.gradients.pop() if learns_input else None
         self._outputs = [output.detach() for output in outputs]
         self._learning = [output.requires_grad for output in outputs]
 
@@ -224,13 +229,14 @@ class _Replay(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         recording: Recording = ctx.recording
         recording.replay_backward(gradients)
+        # Cloned, because an accumulator would store the graph's memory, which the next replay overwrites.
+        by_input = None if recording.by_input is None else recording.by_input.clone()
         if ctx.writes:
             recording.write_gradients()
-            return None, None, None
-        # Cloned, because an accumulator would store the graph's memory, which the next replay overwrites.
+            return None, by_input, None
         return (
             None,
-            None,
+            by_input,
             *(None if gradient is None else gradient.clone() for gradient in recording.gradients),
         )
 
@@ -271,7 +277,8 @@ def _record(part: _Part, x: Tensor, memory: Any) -> Recording:
 def _values_and_gradients(
     part: Callable[[Tensor], Outputs], x: Tensor, learnt: Sequence[nn.Parameter]
 ) -> tuple[Values, Values]:
-    """Copies of the outputs and of the parameters' gradients; restores the parameters' previous gradients."""
+    """Copies of outputs and of gradients of input and parameters; restores the parameters' previous ones."""
+    x = x.detach().requires_grad_(x.requires_grad)
     before = [parameter.grad for parameter in learnt]
     for parameter in learnt:
         parameter.grad = None
@@ -279,7 +286,7 @@ def _values_and_gradients(
     torch.stack([output.float().square().mean() for output in outputs]).sum().backward()
     copies = [
         [None if value is None else value.detach().float().clone() for value in values]
-        for values in (outputs, [parameter.grad for parameter in learnt])
+        for values in (outputs, [x.grad, *(parameter.grad for parameter in learnt)])
     ]
     for parameter, gradient in zip(learnt, before, strict=True):
         parameter.grad = gradient

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wildgs.devices import upload
 from wildgs.geometry.camera import Camera
 from wildgs.rasterize.gsplat_library import load_gsplat
 from wildgs.rasterize.interface import TILE, Projection, Rendering
@@ -103,11 +101,10 @@ def _projection(
 
 
 def blend_tiles(
-    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
+    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[Tensor, "R S"]
 ) -> Rendering:
     """Blends only the chosen tiles; gsplat does not initialise alpha in the others."""
-    tiles = upload(torch.from_numpy(chosen[None]), colors.device)
-    return blend(projection, colors, None, True, tiles)
+    return blend(projection, colors, None, True, chosen[None])
 
 
 def blend(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from wildgs.devices import upload
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.spherical_harmonics import num_sh_bases
 from wildgs.rasterize.interface import EPS2D, TILE, BackendName, Projection, Rendering
@@ -156,20 +157,35 @@ def blend_sample(
     """
     means2d, camera = projection.means2d, projection.camera
     _check("colors", colors, (len(means2d), None), means2d, projection.backend)
-    lines, columns = -(-camera.height // TILE), -(-camera.width // TILE)
-    step = max(1, lines * columns // tiles)
-    # Diagonals of tiles, so that every row and column of tiles is sampled.
-    diagonal = np.add.outer(np.arange(lines), np.arange(columns)) + int(float(torch.rand(())) * step)
+    step = _diagonal_step(camera.width, camera.height, tiles)
+    first = int(float(torch.rand(())) * step)
+    chosen, at = _sampled(camera.width, camera.height, step, first, every, means2d.device)
+    picture = _module(projection.backend).blend_tiles(projection, colors, chosen)
+    pictures = (picture.colors, picture.depth, picture.alpha)
+    return Rendering(*(values[at[0], at[1]] for values in pictures)), (at[0], at[1])
+
+
+def _diagonal_step(width: int, height: int, tiles: int) -> int:
+    """The distance of diagonals of tiles that together have about `tiles` tiles."""
+    return max(1, -(-height // TILE) * -(-width // TILE) // tiles)
+
+
+@lru_cache(maxsize=512)
+def _sampled(
+    width: int, height: int, step: int, first: int, every: int, device: torch.device
+) -> tuple[Bool[Tensor, "R S"], Int[Tensor, "2 P"]]:
+    """Every step-th diagonal of tiles, and rows and columns of every `every`-th pixel in them.
+
+    Diagonals, so that every row and column of tiles is sampled. Kept, since they recur in every step.
+    """
+    diagonal = np.add.outer(np.arange(-(-height // TILE)), np.arange(-(-width // TILE))) + first
     chosen = diagonal % step == 0
     corners = TILE * np.argwhere(chosen)[:, None]
     offsets = np.arange(every // 2, TILE, every)
     inside = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1).reshape(1, -1, 2)
     pixels = (corners + inside).reshape(-1, 2)
-    pixels = pixels[(pixels < (camera.height, camera.width)).all(axis=1)]
-    picture = _module(projection.backend).blend_tiles(projection, colors, chosen)
-    at = upload(torch.from_numpy(pixels.T.copy()), means2d.device)
-    pictures = (picture.colors, picture.depth, picture.alpha)
-    return Rendering(*(values[at[0], at[1]] for values in pictures)), (at[0], at[1])
+    pixels = pixels[(pixels < (height, width)).all(axis=1)]
+    return torch.from_numpy(chosen).to(device), torch.from_numpy(pixels.T.copy()).to(device)
 
 
 def sh_to_colors(

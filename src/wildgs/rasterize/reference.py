@@ -5,7 +5,6 @@ The other backends are tested against it. Semantics are gsplat's classic mode (v
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -126,7 +125,7 @@ def blend(
 
 
 def blend_tiles(
-    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
+    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[Tensor, "R S"]
 ) -> Rendering:
     """Blends all tiles, which include the chosen ones."""
     return blend(projection, colors, None, True)

@@ -137,10 +137,10 @@ def blend(
 
 
 def blend_tiles(
-    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[np.ndarray, "R S"]
+    projection: Projection, colors: Float[Tensor, "N C"], chosen: Bool[Tensor, "R S"]
 ) -> Rendering:
     """Blends only the chosen tiles; the image is 0 in the others."""
     order: np.ndarray = projection.tiles.tile_order
     background = colors.new_zeros(colors.shape[1])
-    order = order[chosen.reshape(-1)[order]]
+    order = order[flat(chosen)[order]]
     return Rendering(*_blend_pictures(projection, colors, background, True, False, order)[:3])
