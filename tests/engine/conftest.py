@@ -26,6 +26,7 @@ def tiny_model() -> WildGSConfig:
 def build_tiny_model() -> WildGSConfig:
     return WildGSConfig(
         local_embeddings=True,
+        embedding_noise=0.0,
         sky=SkyConfig(points=0),
         parsing=ParsingConfig(max_side=32),
         wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8)),

@@ -33,13 +33,14 @@ def wall() -> torch.Tensor:
 def make_wall_model(wall: torch.Tensor):
     """Builds an opaque grey wall as Wild-GS, with parts left out on demand."""
 
-    def make(*without: Ablation, **config: object) -> WildGS:
+    def make(*without: Ablation, embedding_noise: float = 0.0, **config: object) -> WildGS:
         torch.manual_seed(0)
         settings = WildGSConfig(
             local_embeddings=True,
             sky=SkyConfig(points=0),
             fusion=FusionConfig(sh_degree=3),
             without=without,
+            embedding_noise=embedding_noise,
             parsing=ParsingConfig(max_side=32),
             wrapping=WrappingConfig(resolution=16, features=8, widths=(8, 8), **config),  # type: ignore[arg-type]
         )

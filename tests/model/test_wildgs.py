@@ -265,6 +265,17 @@ def test_parts_are_lifted_in_training_alone(share: float, changes: bool, camera,
     assert (not torch.equal(pictures[0], pictures[1]) or not torch.equal(pictures[1], pictures[2])) == changes
 
 
+@pytest.mark.parametrize(("noise", "changes"), [(0.0, False), (0.3, True)])
+def test_embeddings_are_noisy_in_training_alone(noise: float, changes: bool, camera, make_wall_model) -> None:
+    model = make_wall_model(embedding_noise=noise, partial_lifts=0.0)
+    with torch.no_grad():
+        model.fusion.output.weight.normal_()  # initially embeddings hardly matter
+        encoded = [model.encode(photo_of(camera), camera).global_embedding for _ in range(2)]
+    passes = [model.training_pass(photo_of(camera), camera, Stage()).picture for _ in range(2)]
+    assert torch.equal(*passes) is not changes
+    assert torch.equal(*encoded)
+
+
 def test_antialiased_takes_opacity_from_small_gaussians_only(camera, wall, make_wall_model) -> None:
     config, colors = make_wall_model().config, torch.full((len(wall), 3), 128, dtype=torch.uint8)
     small = torch.arange(len(wall)) % 2 == 0

@@ -357,11 +357,11 @@ class WildGS(Method):
             appearance = self.wrap(photo, appearance, projection, lifted, learn=stage.learn_planes)
         rows, landmark = self._rows_to_shade(projection.visible)
         means = take_rows(self.gaussians.means, rows)
-        assert appearance.global_embedding is not None
+        embedding = self._with_noise(appearance.global_embedding)
         local = self.wrapping.local_embeddings(appearance.planes, means)
         intrinsic = self._network_input(self.gaussians.rows["intrinsic"])
         harmonics, codes = self.fusion.of_rows(
-            appearance.global_embedding, local, intrinsic, rows, landmark, self.photo_match.code_weights
+            embedding, local, intrinsic, rows, landmark, self.photo_match.code_weights
         )
         matched = bool(self.config.color_match and self.config.matched_loss)
         colors = sh_to_colors(means, harmonics, camera, degree=stage.sh_degree, clamped=not matched)
@@ -374,6 +374,13 @@ class WildGS(Method):
         rendering = blend(projection, colors)
         developed = self.photo_match.developed(sight, rendering) if matched else None
         return TrainingOutput(rendering, projection, appearance.visibility, colors, developed)
+
+    def _with_noise(self, embedding: Float[Tensor, " G"] | None) -> Float[Tensor, " G"]:
+        """A photo's global embedding in training."""
+        assert embedding is not None
+        if not self.config.embedding_noise:
+            return embedding
+        return embedding * (1 + self.config.embedding_noise * torch.randn_like(embedding))
 
     def _rows_to_shade(self, visible: Bool[Tensor, " N"]) -> tuple[Int[Tensor, " V"], int]:
         """Rows of the landmark's visible Gaussians followed by those of the sky, and the number of the former."""
