@@ -81,7 +81,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     """What their `config.yaml` does not name was not there when they began."""
     plain = to_plain(BASE)
     model, train = plain["model"], plain["train"]
-    for name in ("matched_loss", "light_codes", "light_components", "embedding_noise", "eps2d"):
+    for name in ("matched_loss", "light_codes", "light_components", "eps2d"):
         assert model.pop(name) > 0
     assert model.pop("local_embeddings") is False
     assert model.pop("antialiased") is True
@@ -98,7 +98,6 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     config = from_plain(RunConfig, plain)
     assert not config.model.camera_response.fits
     assert (config.model.matched_loss, config.model.light_codes, config.model.light_components) == (0, 0, 0)
-    assert config.model.embedding_noise == 0
     assert config.model.eps2d == 0.3  # with which its Gaussians were trained
     assert not config.model.antialiased
     assert config.train.schedule.mask_visits == 0
