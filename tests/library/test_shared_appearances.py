@@ -31,6 +31,7 @@ def test_the_day_of_a_new_run_encodes_no_photo(
     monkeypatch.setattr(photos, "encode_view", lambda *_: pytest.fail("encoded again"))
     found = loaded.encode(view)
     for name in ("global_embedding", "visibility", "color_map", "basis_weights"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+        # Sums of other threads are rounded differently.
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-4)
     assert set(find_day(loaded).phases) == {view.name for view in scene.train_views}
     assert loaded.appearance(view.name).embeddings.global_embedding is found.global_embedding
