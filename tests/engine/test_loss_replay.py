@@ -5,14 +5,13 @@ Recording needs CUDA; here `benchmarks/pretend_cuda` notes the loss's operations
 
 from __future__ import annotations
 
-from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.pretend_cuda import graphs
+from tests.emulated_graphs import emulate_graphs
 from wildgs.engine import loss_replay
 from wildgs.engine.loss_replay import LossReplays
 from wildgs.errors import WildGSWarning
@@ -28,23 +27,7 @@ CONFIG = ObjectiveConfig()
 @pytest.fixture(autouse=True)
 def _recorder(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch's recorder, emulated on the CPU, for tensors that say that they are on CUDA."""
-
-    @contextmanager
-    def graph(captured: graphs.CUDAGraph, *, pool: Any, capture_error_mode: str):
-        with graphs.graph(captured, pool=pool, capture_error_mode=capture_error_mode):
-            yield
-
-    emulated = {
-        "graph_pool_handle": lambda: (0, 1),
-        "synchronize": lambda: None,
-        "Stream": lambda: None,
-        "current_stream": lambda: None,
-        "stream": nullcontext,
-        "CUDAGraph": graphs.CUDAGraph,
-        "graph": graph,
-    }
-    for name, value in emulated.items():
-        monkeypatch.setattr(torch.cuda, name, value)
+    emulate_graphs(monkeypatch)
     monkeypatch.setattr(loss_replay, "is_on_cuda", lambda tensor: True)
     monkeypatch.setattr(
         photometric, "ssim", _ConvolutionSSIM.apply
@@ -126,7 +109,7 @@ def test_results_of_a_replay_outlast_the_next(replays: LossReplays):
 def test_every_shape_is_recorded_once_and_large_photos_are_not(
     replays: LossReplays, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(loss_replay, "MOST_PIXELS", 2 * 24 * 30)
+    monkeypatch.setattr(LossReplays, "most_pixels", 2 * 24 * 30)
     replays.switch(True)
     for width in (30, 20, 29):
         for seed in range(EAGER_CALLS + 2):

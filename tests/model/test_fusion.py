@@ -116,7 +116,7 @@ def test_some_of_all_rows_have_the_values_and_gradients_of_regions(
         intrinsic, matrix = features.clone().requires_grad_(), weight.clone().requires_grad_()
         fusion.zero_grad()
         if taken:
-            sh, found = fusion.of_rows(common, local, intrinsic, rows, landmark, matrix)
+            sh, found = fusion.of_rows(common, local, intrinsic, rows, landmark, matrix if codes else None)
         else:
             below, above = intrinsic[rows[:landmark]], intrinsic[rows[landmark:]]
             sh, found = fusion.by_region(common, local, below, above), below @ matrix.T

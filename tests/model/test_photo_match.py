@@ -95,3 +95,10 @@ def test_colours_change_in_training_as_harmonics_do(points: int, light_codes: in
     ordered = torch.cat([colors[~above], colors[above]])
     changed = match.changed(ordered, change, codes, sine_of_elevation(means[above], centre))
     torch.testing.assert_close(changed, torch.cat([expected[~above], expected[above]]))
+
+
+@pytest.mark.parametrize("light_codes", [0, 3])
+def test_a_scene_without_light_codes_has_no_weights_of_them(light_codes: int) -> None:
+    """An empty tensor instead would be on the CPU, also when training is on a GPU."""
+    weights = PhotoMatch(WildGSConfig(light_codes=light_codes)).code_weights
+    assert (weights is None) == (light_codes == 0)

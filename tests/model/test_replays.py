@@ -6,14 +6,14 @@ Recording itself needs CUDA; here `benchmarks/pretend_cuda` notes a network's op
 from __future__ import annotations
 
 import copy
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from benchmarks.pretend_cuda import graphs
+from tests.emulated_graphs import emulate_graphs
 from wildgs.errors import WildGSWarning
 from wildgs.model import replays as replays_module
 from wildgs.model.parsing import Parsing
@@ -30,26 +30,7 @@ class OnCuda(Tensor):
 @pytest.fixture(autouse=True)
 def recorded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Torch's recorder, emulated; gives the capture mode of every graph that was captured."""
-    modes: list[str] = []
-
-    @contextmanager
-    def graph(captured: graphs.CUDAGraph, *, pool: Any, capture_error_mode: str):
-        assert pool == (0, 1)
-        with graphs.graph(captured, pool=pool, capture_error_mode=capture_error_mode):
-            yield
-        modes.append(capture_error_mode)
-
-    for name, value in {
-        "graph_pool_handle": lambda: (0, 1),
-        "synchronize": lambda: None,
-        "Stream": lambda: None,
-        "current_stream": lambda: None,
-        "stream": nullcontext,
-        "CUDAGraph": graphs.CUDAGraph,
-        "graph": graph,
-    }.items():
-        monkeypatch.setattr(torch.cuda, name, value)
-    return modes
+    return emulate_graphs(monkeypatch)
 
 
 @pytest.fixture

@@ -6,19 +6,17 @@ computing them takes the device. Its gradient does not depend on what follows, s
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from wildgs.errors import WildGSWarning
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.losses.evidence import proven_static
 from wildgs.losses.objective import Losses, total_loss, weighted_losses
-from wildgs.model.replays import EAGER_CALLS, MOST_GRAPHS, WARM_UP, alike, captured
+from wildgs.model.replays import WARM_UP, GraphStore, alike, captured
 
 SCALARS = ("mask_weight", "sky_depth")
 """Inputs that are numbers outside of a graph."""
@@ -27,32 +25,10 @@ MOST_PIXELS = 8_000_000
 photo keeps a GPU busy anyway."""
 
 
-class LossReplays:
-    """`total_loss`, or a replay of a captured graph of it.
+class LossReplays(GraphStore["LossRecording"]):
+    """`total_loss`, or a replay of a captured graph of it; only losses on CUDA are captured."""
 
-    Attributes:
-        on: Whether to capture graphs; only losses on CUDA are captured.
-    """
-
-    def __init__(self) -> None:
-        self.on = False
-        self._calls: dict[Hashable, int] = {}
-        self._graphs: dict[Hashable, LossRecording] = {}
-        self._pixels_left = MOST_PIXELS
-        self._memory: Any = None
-
-    @property
-    def recorded(self) -> int:
-        """Number of captured graphs."""
-        return len(self._graphs)
-
-    def switch(self, on: bool) -> None:
-        """Turns capturing on or off and discards all graphs."""
-        self.on = on
-        self._calls.clear()
-        self._graphs.clear()
-        self._pixels_left = MOST_PIXELS
-        self._memory = None
+    most_pixels = MOST_PIXELS
 
     def __call__(
         self, config: ObjectiveConfig, progress: float, photo: Tensor, render: Tensor, **options: Any
@@ -63,45 +39,20 @@ class LossReplays:
         inputs = _as_tensors(config, progress, photo, render, options)
         threshold = options.get("mask_threshold", 0.5)
         key = tuple(
-            (
-                name,
-                value if isinstance(value, float) else (tuple(value.shape), value.dtype, value.requires_grad),
-            )
+            (name, tuple(value.shape), value.dtype, value.requires_grad)
             for name, value in inputs.items()
             if name not in SCALARS
         )
-        recording = self._graphs.get(key)
-        if recording is None:
-            recording = self._record(key, config, threshold, inputs)
+
+        def capture(memory: Any) -> LossRecording:
+            recording = LossRecording(config, threshold, inputs, memory)
+            recording.compare(inputs)
+            return recording
+
+        recording = self.find(key, capture, render.shape[:2].numel())
         if recording is None:
             return weighted_losses(config, **inputs, mask_threshold=threshold)
         return recording(inputs)
-
-    def _record(
-        self, key: Hashable, config: ObjectiveConfig, threshold: float, inputs: Mapping[str, Any]
-    ) -> LossRecording | None:
-        """Captures the loss if its shapes have recurred; turns capturing off where that fails."""
-        self._calls[key] = self._calls.get(key, 0) + 1
-        pixels = inputs["render"].shape[:2].numel()
-        if self._calls[key] <= EAGER_CALLS or len(self._graphs) == MOST_GRAPHS or pixels > self._pixels_left:
-            return None
-        try:
-            self._memory = self._memory or torch.cuda.graph_pool_handle()
-            recording = LossRecording(config, threshold, inputs, self._memory)
-            recording.compare(inputs)
-        except RuntimeError as error:
-            self.switch(False)
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            warnings.warn(
-                f"the loss cannot be captured as a CUDA graph here ({reason}); training continues without it, a "
-                "little slower",
-                WildGSWarning,
-                stacklevel=3,
-            )
-            return None
-        self._graphs[key] = recording
-        self._pixels_left -= pixels
-        return recording
 
 
 class LossRecording:
@@ -134,19 +85,15 @@ class LossRecording:
         ]
         self._learnt = [name for name in tensors if inputs[name].requires_grad]
 
-        def values_and_gradients() -> tuple[Tensor, list[Tensor]]:
-            leaves = {name: self._inputs[name].detach().requires_grad_() for name in self._learnt}
-            losses = weighted_losses(config, **{**self._inputs, **leaves}, mask_threshold=threshold)
-            gradients = torch.autograd.grad(losses.total, list(leaves.values()), materialize_grads=True)
-            return torch.stack(list(losses.terms().values())), list(gradients)
-
         torch.cuda.synchronize()
         with torch.cuda.stream(torch.cuda.Stream()):
             for _ in range(WARM_UP):
-                values_and_gradients()
+                self._computed(self._inputs)
         # Restores the current stream if the capture fails.
         with torch.cuda.stream(torch.cuda.current_stream()):
-            self._graph, (self._terms, self._gradients) = captured(values_and_gradients, memory)
+            self._graph, (self._terms, self._gradients) = captured(
+                lambda: self._computed(self._inputs), memory
+            )
 
     def __call__(self, inputs: Mapping[str, Any]) -> Losses:
         """Replays the loss for other inputs of the same shapes."""
@@ -155,17 +102,21 @@ class LossRecording:
         terms = dict(zip(Losses.NAMES, self._terms.clone(), strict=True))
         return Losses(**{**terms, "total": total})
 
+    def _computed(self, inputs: Mapping[str, Any]) -> tuple[Tensor, list[Tensor]]:
+        """The terms, and the gradients of what gets one."""
+        leaves = {name: inputs[name].detach().requires_grad_() for name in self._learnt}
+        losses = weighted_losses(self._config, **{**inputs, **leaves}, mask_threshold=self._threshold)
+        gradients = torch.autograd.grad(losses.total, list(leaves.values()), materialize_grads=True)
+        return torch.stack(list(losses.terms().values())), list(gradients)
+
     def compare(self, inputs: Mapping[str, Any]) -> None:
         """Compares a replay with eager execution.
 
         Raises:
             RuntimeError: They differ.
         """
-        leaves = {name: inputs[name].detach().requires_grad_() for name in self._learnt}
-        losses = weighted_losses(self._config, **{**inputs, **leaves}, mask_threshold=self._threshold)
-        gradients = torch.autograd.grad(losses.total, list(leaves.values()), materialize_grads=True)
+        terms, gradients = self._computed(inputs)
         self._replay(inputs)
-        terms = torch.stack(list(losses.terms().values()))
         pairs = zip((terms, *gradients), (self._terms, *self._gradients), strict=True)
         if not all(alike([wanted], [found]) for wanted, found in pairs):
             raise RuntimeError("results of a replay differ from eager execution")

@@ -128,7 +128,7 @@ class Fusion(MixedModule):
         intrinsic: Float[Tensor, "N I"],
         rows: Int[Tensor, " V"],
         landmark: int,
-        codes: Float[Tensor, "C I"],
+        codes: Float[Tensor, "C I"] | None,
     ) -> tuple[Float[Tensor, "V K 3"], Float[Tensor, "A C"]]:
         """`by_region` of some of all Gaussians, and a linear function of the features of the landmark's.
 
@@ -138,20 +138,22 @@ class Fusion(MixedModule):
             intrinsic: f^in of all Gaussians.
             rows: Indices of the landmark's Gaussians, followed by those of the sky's.
             landmark: Number of the former, A.
-            codes: Weights of the linear function; C may be 0.
+            codes: Weights of the linear function; None for C = 0.
         """
         if intrinsic.is_cuda or not _is_shared(local_embeddings) or not has_avx512():
             below, above = take_rows(intrinsic, rows).split([landmark, len(rows) - landmark])
             harmonics = self.by_region(global_embedding, local_embeddings, below, above)
-            return harmonics, functional.linear(below, codes)
+            return harmonics, below[:, :0] if codes is None else functional.linear(below, codes)
         weights = self._layers(global_embedding, local_embeddings[0])
-        regions = [(rows[:landmark], (*weights, codes if len(codes) else None))]
+        regions = [(rows[:landmark], (*weights, codes))]
         if landmark < len(rows):
             if self.sky is not None:
                 weights = self.sky._layers(global_embedding, local_embeddings[0, :0])
             regions.append((rows[landmark:], (*weights, None)))
         harmonics, found = fused_layers(intrinsic, regions)
-        return harmonics.reshape(-1, self.coefficients, 3), found.reshape(landmark, len(codes))
+        if codes is None:
+            found = intrinsic.new_empty(landmark, 0)
+        return harmonics.reshape(-1, self.coefficients, 3), found
 
     def with_sky(
         self,

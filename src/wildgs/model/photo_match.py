@@ -121,11 +121,9 @@ class PhotoMatch(nn.Module):
         return 4 + self.num_codes + (SKY_COLUMNS if self.config.sky.points else 0)
 
     @property
-    def code_weights(self) -> Float[Tensor, "L I"]:
-        """The matrix from an intrinsic feature to light codes."""
-        if self.codes is None:
-            return torch.empty(0, self.config.fusion.intrinsic_size)
-        return self.codes.weight
+    def code_weights(self) -> Float[Tensor, "L I"] | None:
+        """The matrix from an intrinsic feature to light codes; None without light codes."""
+        return None if self.codes is None else self.codes.weight
 
     def light_codes(self, intrinsic: Float[Tensor, "N I"]) -> Float[Tensor, "N L"]:
         """Light codes of the Gaussians, by which their transforms vary."""

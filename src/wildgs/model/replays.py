@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -37,27 +37,26 @@ Outputs = tuple[Tensor, ...]
 Network = Callable[..., Outputs]
 Values = list[Tensor | None]
 Result = TypeVar("Result")
+Graph = TypeVar("Graph")
 
 
-class Replays:
-    """Calls a network, or replays a captured graph of it.
-
-    All graphs of a network share their memory: results of a replay, including gradients, must be used before the
-    next replay of any shape.
+class GraphStore(Generic[Graph]):
+    """Captured graphs by what they depend on. All of them share their memory.
 
     Attributes:
-        on: Whether to capture graphs; only calls on CUDA with gradients are captured.
+        on: Whether to capture graphs.
+        most_pixels: Upper bound on the pixels of all graphs together; None for none.
     """
+
+    most_pixels: int | None = None
 
     def __init__(self) -> None:
         self.on = False
-        self._calls: dict[Hashable, int] = {}
-        self._graphs: dict[Hashable, Recording] = {}
-        self._memory: Any = None
+        self.switch(False)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Replays:
+    def __deepcopy__(self, memo: dict[int, Any]) -> GraphStore[Graph]:
         """A copy without graphs, since a copied network has other parameters."""
-        copy = Replays()
+        copy = type(self)()
         copy.on = self.on
         return copy
 
@@ -69,9 +68,48 @@ class Replays:
     def switch(self, on: bool) -> None:
         """Turns capturing on or off and discards all graphs."""
         self.on = on
-        self._calls.clear()
-        self._graphs.clear()
-        self._memory = None
+        self._calls: dict[Hashable, int] = {}
+        self._graphs: dict[Hashable, Graph] = {}
+        self._pixels = 0
+        self._memory: Any = None
+
+    def find(self, key: Hashable, capture: Callable[[Any], Graph], pixels: int = 0) -> Graph | None:
+        """The graph of a key, or None if it is not captured (yet).
+
+        Capturing is turned off, with a warning, when it fails.
+
+        Args:
+            key: What the graph depends on.
+            capture: Captures it into a memory pool; a RuntimeError means that it cannot be captured.
+            pixels: What it counts towards `most_pixels`.
+        """
+        if key in self._graphs:
+            return self._graphs[key]
+        self._calls[key] = self._calls.get(key, 0) + 1
+        full = self.most_pixels is not None and self._pixels + pixels > self.most_pixels
+        if self._calls[key] <= EAGER_CALLS or len(self._graphs) == MOST_GRAPHS or full:
+            return None
+        try:
+            self._memory = self._memory or torch.cuda.graph_pool_handle()
+            self._graphs[key] = capture(self._memory)
+        except RuntimeError as error:
+            self.switch(False)
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            warnings.warn(
+                f"CUDA graphs do not work here ({reason}); training continues without them, a little slower",
+                WildGSWarning,
+                stacklevel=3,
+            )
+            return None
+        self._pixels += pixels
+        return self._graphs[key]
+
+
+class Replays(GraphStore["Recording"]):
+    """Calls a network, or replays a captured graph of it; only calls on CUDA with gradients are captured.
+
+    Results of a replay, including gradients, must be used before the next replay of any shape.
+    """
 
     def records(self, x: Tensor) -> bool:
         """Whether calls with the input `x` are captured."""
@@ -89,27 +127,11 @@ class Replays:
             x: Input.
             settings: Further arguments; each combination is captured separately.
         """
-        if not self.records(x):
-            return network(x, *settings)
-        key = (tuple(x.shape), x.requires_grad, *settings)
-        if key in self._graphs:
-            return self._graphs[key](x)
-        self._calls[key] = self._calls.get(key, 0) + 1
-        if self._calls[key] <= EAGER_CALLS or len(self._graphs) == MOST_GRAPHS:
-            return network(x, *settings)
-        try:
-            self._memory = self._memory or torch.cuda.graph_pool_handle()
-            self._graphs[key] = _record(_Part(network, modules, settings), x, self._memory)
-        except RuntimeError as error:
-            self.switch(False)
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            warnings.warn(
-                f"CUDA graphs do not work here ({reason}); training continues without them, a little slower",
-                WildGSWarning,
-                stacklevel=2,
-            )
-            return network(x, *settings)
-        return self._graphs[key](x)
+        graph = None
+        if self.records(x):
+            key = (tuple(x.shape), x.requires_grad, *settings)
+            graph = self.find(key, lambda memory: _record(_Part(network, modules, settings), x, memory))
+        return network(x, *settings) if graph is None else graph(x)
 
 
 class _Part(nn.Module):
