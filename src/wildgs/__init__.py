@@ -1,6 +1,6 @@
 """Wild-GS: relightable 3D Gaussian scenes from unconstrained photo collections.
 
-Every verb of the command line is a function of this package (docs/python.md). All names are imported lazily, so
+Every command of the command line is a function of this package (docs/python.md). All names are imported lazily, so
 that `import wildgs` is fast.
 """
 

@@ -95,7 +95,7 @@ def test_demo_ends_with_a_page(
 
 
 MISTAKES = {
-    "unknown verb": (("fly",), "unknown verb 'fly'"),
+    "unknown verb": (("fly",), "unknown command 'fly'"),
     "scene missing": (("train", "{tmp}/nowhere", "--output", "{tmp}/run"), "nowhere"),
     "not a run": (("eval", "{tmp}"), "not a run folder"),
     "run exists": (("train", "{landmark}", "--output", "{trained}"), "already holds a run"),
@@ -111,7 +111,7 @@ MISTAKES = {
     "no photos": (("sfm", "{tmp}", "--output", "{tmp}/../scene-elsewhere"), "no photo"),
     "no room for a colour": (
         ("train", "{landmark}", "--output", "{tmp}/run", "--fusion.intrinsic-size", "2"),
-        "intrinsic_size 2: must be 3 or more",
+        "--fusion.intrinsic-size 2: must be 3 or more",
     ),
     "bad downscale": (("train", "{landmark}", "--output", "{tmp}/run", "--downscale", "0"), "downscale"),
 }

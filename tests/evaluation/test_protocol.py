@@ -305,7 +305,7 @@ def test_training_mode_is_restored(tmp_path):
 
 
 def test_a_scene_without_test_photos_is_a_users_mistake(tmp_path):
-    with pytest.raises(UserError, match="no test photos"):
+    with pytest.raises(UserError, match="no held-out photos"):
         evaluate(Painter(lambda photo: photo), scene(view("a.jpg", "train")), "full", tmp_path, step=1)
 
 

@@ -48,7 +48,7 @@ class Page {
     window.addEventListener("keydown", (event) => (this.shift = event.shiftKey));
     window.addEventListener("keyup", (event) => (this.shift = event.shiftKey));
     this.canvas.addEventListener("pointerdown", () => this.free());
-    this.canvas.addEventListener("webglcontextlost", () => fail("The graphics driver gave up; reload the page."));
+    this.canvas.addEventListener("webglcontextlost", () => fail("The WebGL context was lost; reload the page."));
   }
 
   setMode(mode) {

@@ -102,7 +102,7 @@ def _dispatch(arguments: list[str]) -> None:
         return
     verb, *rest = arguments
     if verb not in VERBS:
-        raise UserError(f"unknown verb {verb!r}; `wildgs --help` lists the verbs")
+        raise UserError(f"unknown command {verb!r}; `wildgs --help` lists the commands")
     if processes.world_size() > 1 and verb not in DISTRIBUTED:
         raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
     with processes.library_environment():
@@ -223,5 +223,5 @@ def _usage() -> str:
     verbs = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in VERBS.items())
     return (
         f"wildgs {__version__}: relightable 3D scenes from photo collections\n\n"
-        f"usage: wildgs VERB ...\n\n{verbs}\n\n`wildgs VERB --help` shows a verb's options and an example."
+        f"usage: wildgs COMMAND ...\n\n{verbs}\n\n`wildgs COMMAND --help` shows a command's options and an example."
     )

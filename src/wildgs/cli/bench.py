@@ -60,7 +60,7 @@ class Command:
     for comparison. Wild-GS and its ablations then use the preset paper; `default` is a separate row."""
     methods: tuple[str, ...] | None = None
     """Methods of `wildgs train`, wildgs-half-steps (the paper's †), presets, and ablations (without-PART). Default:
-    all."""
+    those that docs/bench.md lists for the suite."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME:KEY=VALUE[,KEY=VALUE...]: an additional row with Wild-GS and some entries of config.yaml changed, for
     example slow:model.learning_rates.networks=5e-4."""

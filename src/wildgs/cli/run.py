@@ -39,7 +39,7 @@ class Command:
     max_gaussians: int | None = None
     """Upper bound on the number of Gaussians. Default: depends on the machine's memory."""
     holdout: int | None = None
-    """Hold out every n-th photo for scoring; 0 = none. (default: 8)"""
+    """Hold out every n-th photo for scoring; 0 = none. Default: 8."""
     sfm: tyro.conf.OmitArgPrefixes[SfmConfig] = field(default_factory=SfmConfig)
     image_cache: str = IMAGE_CACHE
     """Memory for decoded photos; photos that do not fit are decoded again at every use."""

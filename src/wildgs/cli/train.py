@@ -56,8 +56,7 @@ class Command:
     colours). `--method NAME --help-all` lists a method's options."""
     preset: PresetName = "default"
     """default: best measured results; paper: the paper's method without additions; paper-mended: the same with
-    stable training of mask and fusion; fast: half the steps and a lighter 2D Parsing. Other options override the
-    preset."""
+    stable training of mask and fusion; fast: half the steps. Other options override the preset."""
     resume: bool = False
     """Resume from the newest checkpoint with the run's configuration. Only --max-gaussians and options that do not
     affect the result may change."""

@@ -18,10 +18,10 @@ class ScheduleConfig:
         first_stage: Length of the first stage in steps: no triplane and no depth loss until the mask is useful.
         densify_from: Step of the first densification (3DGS: 500).
         densify_until: Step of the last densification and opacity reset. Default: 24,000 with the strategy
-            relocation, 15,000 (3DGS) with the others.
+            relocation, 25,000 with mcmc, 15,000 (3DGS) with classic and absgrad.
         densify_every: Steps between densifications (3DGS: 100); 0 = no densification, pruning or opacity resets.
-        reset_every: Steps between opacity resets; 0 = no resets. Default: 3,000 for 3dgs and affine; none for
-            wildgs, nor with the strategy relocation.
+        reset_every: Steps between opacity resets; 0 = no resets. Default: 3,000 for 3dgs and affine; 0 for
+            wildgs and for the strategies relocation and mcmc.
         mask_pause: Steps after an opacity reset during which the mask is not trained, because it would mistake the
             spike in the loss for a transient.
         sh_every: Steps between increases of the active SH degree (3DGS: 1,000).
@@ -51,7 +51,7 @@ class ScheduleConfig:
         for name, value in vars(self).items():
             least = 1 if name in ("sh_every", "encoder_every", "mask_every", "planes_every") else 0
             if value is not None and value < least:
-                raise UserError(f"schedule.{name} {value}: must be {least} or more")
+                raise UserError(f"--schedule.{name.replace('_', '-')} {value}: must be {least} or more")
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,13 @@ class DensityConfig:
             this; absgrad uses four times this value.
         split_scale: Gaussians larger than this fraction of the scene extent are split; smaller ones are cloned.
         prune_opacity: Prune Gaussians whose opacity is lower.
-        prune_scale: After the first opacity reset, prune Gaussians larger than this fraction of the scene extent.
-        prune_by_distance: For Gaussians outside the scene extent, apply --density.prune-scale to their distance
+        prune_scale: Strategies classic and absgrad: after the first opacity reset, prune Gaussians larger than this
+            fraction of the scene extent.
+        prune_by_distance: For Gaussians outside the scene extent, relate --density.prune-scale to their distance
             from the scene centre, since distant Gaussians may be larger. Not in 3DGS.
-        prune_reach: After the first opacity reset, prune Gaussians whose projected radius exceeds this fraction of
-            an image's longer side; most are floaters close to a camera. 0 = off. Not in 3DGS.
+        prune_reach: Strategies classic and absgrad: after the first opacity reset, prune Gaussians whose projected
+            radius exceeds this fraction of an image's longer side; most are floaters close to a camera. 0 = off.
+            Not in 3DGS.
         reset_opacity: Upper bound to which an opacity reset lowers opacities.
         reset_unseen: Also reset Gaussians that no photo has seen yet, as 3DGS does; no photo would raise their
             opacity again.
@@ -180,4 +182,4 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Validates the number of steps."""
         if self.steps < 1:
-            raise UserError(f"steps {self.steps}: must be 1 or more")
+            raise UserError(f"--steps {self.steps}: must be 1 or more")

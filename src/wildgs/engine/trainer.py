@@ -359,7 +359,8 @@ class Trainer:
         self.optimizers.restore(_under(state, "optimizer."))
         if not self.sampler.restore(_under(state, "sampler.")):
             message = (
-                f"the run was started with other photos and continues with the present {len(self.views)}"
+                "the training photos have changed since the run was started;"
+                f" it continues with the current {len(self.views)}"
             )
             warnings.warn(message, WildGSWarning, stacklevel=2)
         self.density.restore(_under(state, "density."))

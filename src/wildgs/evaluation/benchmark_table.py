@@ -119,8 +119,8 @@ def legend(rows: Sequence[Row]) -> list[str]:
         )
     if any(row.quantities.get("detail_energy") is not None for row in rows):
         lines.append(
-            "Detail: standard deviation of high frequencies over the truth's (1 is best), and their correlation "
-            "with the truth's."
+            "Detail: standard deviation of high frequencies relative to the ground truth (1 is best), and their "
+            "correlation with the ground truth."
         )
     if any(row.quantities.get("static_hidden") is not None for row in rows):
         lines.append(

@@ -116,7 +116,9 @@ def evaluate(
         UserError: The scene has no test views.
     """
     if not scene.test_views:
-        raise UserError(f"{scene.root} has no test photos to evaluate: mark some as 'test' in its split .tsv")
+        raise UserError(
+            f"{scene.root} has no held-out photos to score: mark some as 'test' in its split .tsv"
+        )
     folder = run / "eval" / protocol
     lpips, line = load_lpips(lpips_folder)
     notes = _Notes([line])

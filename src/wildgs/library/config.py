@@ -45,13 +45,16 @@ def reference_preset(suite: Suite | None) -> PresetName:
 
 
 def default_bench_methods(suite: Suite | None) -> tuple[str, ...]:
-    """All of `BENCH_METHODS` except the preset of the row `wildgs` and ablations that do not apply to it.
+    """All of `BENCH_METHODS` except the preset of the row `wildgs`, its repetition and what does not apply to it.
 
+    The preset `fast` equals the row of half the steps, except in the paper's suite.
     The default has no 3D Wrapping, so that the ablations of its parts do not apply. Stereo is used only if depth
     maps were made, so that its row has to be asked for. The paper's suite has the paper's ablations only.
     """
     parts = ("stereo", *WRAPPING_PARTS) if suite is None else ENTRIES_WITHOUT
     absent = {reference_preset(suite), *(WITHOUT + part for part in parts)}
+    if suite is None:
+        absent.add("fast")
     return tuple(name for name in BENCH_METHODS if name not in absent)
 
 

@@ -203,7 +203,10 @@ def _depth_weights() -> Check:
     # Only safetensors: weights in pickle files could execute code.
     if isinstance(try_to_load_from_cache(DEPTH_ANYTHING, "model.safetensors"), str):
         return Check(name, "works", f"{DEPTH_ANYTHING} is cached")
-    detail = f"{DEPTH_ANYTHING} is not cached; it is downloaded at its first use; without it there is no depth loss"
+    detail = (
+        f"{DEPTH_ANYTHING} is not cached; it is downloaded at its first use;"
+        " without it only depth by stereo is used"
+    )
     return Check(name, "missing", detail, f"hf download {DEPTH_ANYTHING}")
 
 
@@ -216,7 +219,7 @@ def _lpips() -> Check:
 
 def _viewer() -> Check:
     if importlib.util.find_spec("viser") is None:
-        return Check("viewer", "missing", "`wildgs view` needs viser", _pip("viser"))
+        return Check("viewer", "missing", "`wildgs view` needs viser", _pip("'viser>=1.1,<1.2'"))
     return Check("viewer", "works", f"viser {importlib.metadata.version('viser')}")
 
 

@@ -95,8 +95,8 @@ def export(
     files = _files(request, looks, kinds, alone=len(kinds) == len(formats))
     if scene.gaussians.antialiased and any(kind != "html" for kind in formats):
         logger.info(
-            "the run is antialiased, which these files cannot say: programs that render without antialiasing show "
-            "small Gaussians too solid from afar (docs/export.md)"
+            "the run is antialiased, which these formats cannot record: programs that render without antialiasing"
+            " show small Gaussians too opaque from a distance (docs/export.md)"
         )
     several = [kind for kind in formats if kind in ("html", "glb", "usd")]
     shown = looks if chosen or not several else page_looks(scene, progress)

@@ -171,7 +171,9 @@ def read_scene(config: RunConfig, execution: ExecutionConfig, progress: Progress
     show = counter(progress, "reading photos")
     scene = load_scene(config.scene, config.data, image_cache=execution.image_cache, progress=show)
     train, test = len(scene.train_views), len(scene.test_views)
-    logger.info(f"{scene.root}: {train} training photos, {test} test photos, {len(scene.points):,} points")
+    logger.info(
+        f"{scene.root}: {train} training photos, {test} held-out photos, {len(scene.points):,} points"
+    )
     return scene
 
 

@@ -113,12 +113,12 @@ class FusionConfig:
         """Validates the sizes."""
         if self.intrinsic_size < 3:
             raise UserError(
-                f"intrinsic_size {self.intrinsic_size}: must be 3 or more, since it starts with a Gaussian's colour"
+                f"--fusion.intrinsic-size {self.intrinsic_size}: must be 3 or more, for a Gaussian's colour"
             )
         if self.hidden < 1:
-            raise UserError(f"hidden {self.hidden}: must be 1 or more")
+            raise UserError(f"--fusion.hidden {self.hidden}: must be 1 or more")
         if not 0 <= self.sh_degree <= 3:
-            raise UserError(f"sh_degree {self.sh_degree}: must be between 0 and 3")
+            raise UserError(f"--fusion.sh-degree {self.sh_degree}: must be between 0 and 3")
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ class WildGSConfig:
     """Wild-GS.
 
     Attributes:
-        without: Parts to leave out, for ablations.
+        without: Parts to leave out, for ablations; crop, reverse and local need --local-embeddings.
         mask_threshold: Threshold Th: pixels with a higher visibility are static (used by lifting and depth loss).
         parsing: 2D Parsing.
         local_embeddings: Give every Gaussian a local embedding of the photo by 3D Wrapping, as in the paper. By

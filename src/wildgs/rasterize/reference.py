@@ -1,6 +1,7 @@
 """Reference rasteriser in dense PyTorch: slow, differentiable by autograd, in float32 or float64.
 
-The other backends are tested against it. Semantics are gsplat's classic mode (version 1.5), see `interface`.
+The other backends are tested against it. Semantics are those of gsplat 1.5's modes classic and antialiased, see
+`interface`.
 """
 
 from __future__ import annotations

@@ -43,13 +43,13 @@ class DataConfig:
     def __post_init__(self) -> None:
         """Validates the values."""
         if not 1 <= self.downscale < float("inf"):
-            raise UserError(f"downscale {self.downscale}: must be 1 (full size) or more")
+            raise UserError(f"--downscale {self.downscale}: must be 1 (full size) or more")
         if self.max_side is not None and self.max_side < 1:
-            raise UserError(f"max-side {self.max_side}: must be above 0")
+            raise UserError(f"--max-side {self.max_side}: must be above 0")
         if self.holdout < 0 or self.holdout == 1:
-            raise UserError(f"holdout {self.holdout}: must be 0 (train on all photos) or at least 2")
+            raise UserError(f"--holdout {self.holdout}: must be 0 (train on all photos) or at least 2")
         if self.max_image_pixels < 1:
-            raise UserError(f"max-image-pixels {self.max_image_pixels}: must be above 0")
+            raise UserError(f"--max-image-pixels {self.max_image_pixels}: must be above 0")
 
 
 def parse_bytes(text: str) -> int:

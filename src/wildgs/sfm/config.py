@@ -13,10 +13,10 @@ class PairingConfig:
     """Selection of image pairs to match."""
 
     exhaustive_features: int = 500_000
-    """Match all pairs in sets whose photos have up to this many features in total, on which the time depends: 60
-    large photos, or 250 of 2,000 features."""
+    """Match all pairs if the photos have at most this many features in total, for example 60 photos of 8,192
+    features. Matching time grows with the square."""
     neighbours: int = 32
-    """Photos that each photo is matched with in sets of more features."""
+    """Number of photos to match each photo with in larger sets."""
     gps_share: float = 0.8
     """Choose pairs by GPS position if at least this fraction of the photos has one."""
     gps_distance: float = 200.0
@@ -39,7 +39,7 @@ class SfmConfig:
     """Estimate the affine shape of features, which matches oblique views better; extraction takes 1.4 times as
     long."""
     second_chance: bool = True
-    """Try photos without a pose again: match them to 3D points and to more photos."""
+    """Run the second and third pass: match photos without a pose to 3D points, and to more photos."""
     threads: int = -1
     """CPU threads; -1 = all."""
     seed: int = 0
@@ -48,6 +48,6 @@ class SfmConfig:
     def __post_init__(self) -> None:
         for name in ("max_image_size", "max_features", "max_image_pixels"):
             if getattr(self, name) < 1:
-                raise UserError(f"{name.replace('_', '-')} {getattr(self, name)}: must be 1 or more")
+                raise UserError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be 1 or more")
         if self.threads != -1 and self.threads < 1:
-            raise UserError(f"threads {self.threads}: must be 1 or more, or -1 for all")
+            raise UserError(f"--threads {self.threads}: must be 1 or more, or -1 for all")

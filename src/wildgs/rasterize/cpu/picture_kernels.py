@@ -68,7 +68,7 @@ def get_rows(patch, per_pixel, picture, x, y, width, height):
 
 @njit(nogil=True)
 def ask_for_tile(tx, ty, width, height, per_pixel, picture, to_write):
-    """Asks for the cache lines of a tile in a picture: its rows lie far apart, and no hardware foresees them."""
+    """Prefetches a tile's cache lines: its rows are far apart, which hardware prefetchers do not detect."""
     for line in range(min(TILE, height - ty * TILE)):
         at = ((ty * TILE + line) * width + tx * TILE) * per_pixel
         for step in range(0, TILE * per_pixel, LANES):

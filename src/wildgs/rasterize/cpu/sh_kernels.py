@@ -107,7 +107,7 @@ def shade_forward(counter, means, sh, bases, degree, eye, visible, floor, out):
 
 @njit(nogil=True)
 def shade_backward(counter, means, sh, bases, degree, eye, visible, floor, out, v_out, v_sh, v_means):
-    """Gradients of the coefficients and (where `v_means` is no None) of the means."""
+    """Gradients of the coefficients and (if `v_means` is not None) of the means."""
     n = visible.size
     used = (degree + 1) * (degree + 1)
     values = np.empty(16, np.float32)

@@ -234,7 +234,7 @@ def write_pairs(counter, nearest, spans, records, starts, tiles_x, cursors, entr
 
 @njit(nogil=True)
 def write_or_spare(bit, tile, rank, slot, row, entries, spare):
-    """Writes a pair to the tile's list if `bit` is 1, else where nobody reads; without a branch. The next slot."""
+    """Writes a pair to the tile's list if `bit` is 1, else to an unused slot, branch-free; returns the next."""
     at = row[tile]
     row[tile] = at + bit
     to = at if bit != 0 else spare
