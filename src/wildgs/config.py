@@ -309,6 +309,10 @@ def read_config(path: Path) -> RunConfig:
         if text.startswith(_BEGIN) and _END not in text.splitlines():
             raise UserError(f"{path} is truncated: the line {_END!r} is missing; restore it from a copy")
         plain = yaml.load(text, _Loader)
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{path.parent} contains no run: {path.name} is missing; give another folder, or train without --resume"
+        ) from error
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: an invalid date
         raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
     for part, name in _MOVED:

@@ -188,7 +188,7 @@ def _announce() -> None:
     if not _announced.is_set():
         _announced.set()
         print(
-            "wildgs: compiling the CPU kernels (once; kept on disk)",
+            "wildgs: compiling CPU kernels (kept on disk for later runs)",
             file=sys.stderr,
             flush=True,
         )

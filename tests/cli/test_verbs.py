@@ -99,7 +99,10 @@ MISTAKES = {
     "scene missing": (("train", "{tmp}/nowhere", "--output", "{tmp}/run"), "nowhere"),
     "not a run": (("eval", "{tmp}"), "not a run folder"),
     "run exists": (("train", "{landmark}", "--output", "{trained}"), "already holds a run"),
-    "nothing to resume": (("train", "{landmark}", "--output", "{tmp}/new", "--resume"), "config.yaml"),
+    "nothing to resume": (("train", "{landmark}", "--output", "{tmp}/new", "--resume"), "without --resume"),
+    "empty output": (("run", "{landmark}/images", "--output", ""), "the value of --output is empty"),
+    "empty path": (("train", "", "--output={tmp}/run"), "is empty"),
+    "empty by equals": (("train", "{landmark}", "--output="), "the value of --output is empty"),
     "no LPIPS weights": (
         ("eval", "{trained}", "--lpips", "{tmp}/nowhere"),
         "no such folder; leave it out",
@@ -154,7 +157,7 @@ def test_help_as_a_subprocess_is_instant_and_loads_no_torch() -> None:
     start = time.monotonic()
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    assert "wildgs VERB" in result.stdout
+    assert "wildgs COMMAND" in result.stdout
     assert time.monotonic() - start < 5
 
 

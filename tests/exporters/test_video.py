@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -107,3 +108,23 @@ def test_odd_sizes_and_strange_names_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="is a file"):
         write_frames(tmp_path / "file", frames(), (WIDTH, HEIGHT), 24.0)
+
+
+def test_a_video_that_ffmpeg_cannot_finish_leaves_the_old_one(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    file = tmp_path / "a.mp4"
+    write_frames(file, frames(), (WIDTH, HEIGHT), 24.0)
+    before = file.read_bytes()
+    script = f"""
+import numpy as np, resource, signal
+from pathlib import Path
+from wildgs.exporters.video import write_frames
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+noise = np.random.default_rng(0).integers(0, 255, ({COUNT}, {HEIGHT}, {WIDTH}, 3)).astype(np.uint8)
+write_frames(Path({str(file)!r}), noise, ({WIDTH}, {HEIGHT}), 24.0)
+"""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", script], capture_output=True, text=True)
+    assert "UserError" in done.stderr
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from PIL import Image
 
 import wildgs
 from wildgs.errors import UserError
+from wildgs.geometry.camera_file import write_camera_path
 from wildgs.library.rendering import check_size
 
 
@@ -52,3 +54,43 @@ def test_without_held_out_photos_all_viewpoints_are_rendered(landmark: Path, tmp
     )
     done = wildgs.render(run.folder, tmp_path / "out")
     assert done.pictures == len(wildgs.load(run.folder).views) == 9
+
+
+def test_one_appearance_may_be_a_plain_name(trained: Path, tmp_path: Path) -> None:
+    assert wildgs.render(trained, tmp_path / "a.png", appearance="neutral").pictures == 1
+    view = wildgs.load(trained).views[0].name
+    written = wildgs.gallery(trained, tmp_path / "b.jpg", views=[view], appearance="neutral")
+    assert written.sheet.is_file()
+
+
+@pytest.mark.parametrize("fps", [0.0, -5.0, math.nan, math.inf, 1e12])
+def test_frame_rates_that_no_video_has_are_refused(fps: float, trained: Path, tmp_path: Path) -> None:
+    scene = wildgs.load(trained)
+    cameras = tmp_path / "cameras.json"
+    write_camera_path(cameras, [view.camera for view in scene.views[:2]], fps=10.0)
+    for path in ("orbit", str(cameras)):
+        with pytest.raises(UserError, match="--fps"):
+            wildgs.render(scene, tmp_path / "out", trajectory=wildgs.TrajectoryOptions(path=path, fps=fps))
+    options = wildgs.TrajectoryOptions(path=str(cameras), seconds=9.0)
+    with pytest.raises(UserError, match="--seconds"):
+        wildgs.render(scene, tmp_path / "out", trajectory=options)
+
+
+def test_a_run_is_not_written_among_the_photos(landmark: Path) -> None:
+    config = wildgs.RunConfig(method="3dgs", train=wildgs.TrainConfig(steps=2))
+    before = sorted(path.name for path in landmark.iterdir())
+    for output in (landmark, landmark / "images", landmark / "sparse" / "run"):
+        with pytest.raises(UserError, match="another --output"):
+            wildgs.train(landmark, config, output=output)
+    assert sorted(path.name for path in landmark.iterdir()) == before
+    assert not (landmark / "images" / ".lock").exists()
+
+
+@pytest.mark.parametrize("protocols", ["fuller", ["half", "Full"]])
+def test_unknown_protocols_are_refused(protocols, trained: Path) -> None:
+    with pytest.raises(UserError, match="choose full or half"):
+        wildgs.evaluate(trained, protocols)
+
+
+def test_a_protocol_may_be_a_plain_name(trained: Path) -> None:
+    assert list(wildgs.evaluate(trained, "half")) == ["half"]

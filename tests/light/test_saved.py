@@ -140,3 +140,18 @@ def test_a_saved_picture_without_a_colour_map_mixes_with_a_photo(method, look, w
         mixed = mix([back, look], [0.5, 0.5])
         torch.testing.assert_close(mixed.embeddings.color_map, 0.5 * look.embeddings.color_map)
         assert mixed.sh.isfinite().all()
+
+
+def test_only_an_appearance_is_replaced(method, look, tmp_path: Path) -> None:
+    file = save_look(look, tmp_path / "a.safetensors")
+    save_look(look, file)
+    for name, content in (("other", None), ("text", b"no tensors")):
+        other = tmp_path / f"{name}.safetensors"
+        if content is None:
+            save_file({"values": torch.zeros(3)}, other)
+        else:
+            other.write_bytes(content)
+        before = other.read_bytes()
+        with pytest.raises(UserError, match="not an appearance file"):
+            save_look(look, other)
+        assert other.read_bytes() == before

@@ -176,3 +176,10 @@ def test_broken_photos_and_giants_are_reported(tmp_path: Path) -> None:
     assert [copy.name for copy in copies] == ["a.png"]
     assert set(broken) == {"b.png", "giant.png"}
     assert len(caught) == 2
+
+
+def test_links_to_nothing_are_named(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg")
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    with pytest.warns(WildGSWarning, match="1 links point to files that do not exist.*gone.jpg"):
+        assert list_photos(tmp_path) == ["a.jpg"]

@@ -101,12 +101,22 @@ def _dispatch(arguments: list[str]) -> None:
         print(f"wildgs {__version__}")
         return
     verb, *rest = arguments
+    _refuse_empty(rest)
     if verb not in VERBS:
         raise UserError(f"unknown command {verb!r}; `wildgs --help` lists the commands")
     if processes.world_size() > 1 and verb not in DISTRIBUTED:
         raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
     with processes.library_environment():
         _run(verb, rest)
+
+
+def _refuse_empty(arguments: list[str]) -> None:
+    """Raises `UserError` for an empty argument, which would be read as the current folder; a title may be empty."""
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        option, equals, value = argument.partition("=")
+        if before != "--title" and (not argument or (option.startswith("--") and equals and not value)):
+            which = f" of {before}" if before.startswith("--") else f" of {option}" if equals else ""
+            raise UserError(f"the value{which} is empty; give one (an unset variable of the shell is empty)")
 
 
 def _run(verb: str, arguments: list[str]) -> None:

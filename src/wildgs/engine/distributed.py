@@ -218,8 +218,8 @@ def _peers() -> Iterator[None]:
         reason = (str(error).splitlines() or [""])[0]
         message = (
             "another process of this training ended or does not answer, so all of them stop (torchrun reports "
-            "below which one failed first); run the same command with --resume to continue from the newest "
-            f"checkpoint with any number of processes. Cause: {reason}"
+            "below which one failed first); run the same command again (`wildgs train`: with --resume) to continue "
+            f"from the newest checkpoint with any number of processes. Cause: {reason}"
         )
         raise (LostRankError(message) if _notices_first() else ReportedError(message)) from error
 

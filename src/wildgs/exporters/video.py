@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -25,6 +26,7 @@ ENCODING: dict[str, Any] = {
     "codec": "libx264",
     "quality": None,
     "macro_block_size": 2,
+    "ffmpeg_log_level": "quiet",
     "output_params": ["-crf", "18", "-movflags", "+faststart"],
 }
 """Visually lossless H.264 that all browsers play."""
@@ -74,7 +76,7 @@ def write_frames(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
         fps: Frames per second.
 
     Raises:
-        UserError: See `check_output`; or the video cannot be encoded.
+        UserError: See `check_output`; or the video cannot be encoded or written.
     """
     check_output(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,15 +91,26 @@ def _write_video(path: Path, frames: Frames, size: tuple[int, int], fps: float) 
         raise UserError(f"{size[0]} x {size[1]}: width and height of a video must be even")
     encoding = ENCODING | {"output_params": [*ENCODING["output_params"], "-f", MUXERS[path.suffix.lower()]]}
     with written_aside(path) as aside:
-        writer = _ffmpeg().write_frames(str(aside), size, fps=fps, **encoding)
+        writer, sent = _ffmpeg().write_frames(str(aside), size, fps=fps, **encoding), 0
         try:
             writer.send(None)
             for frame in frames:
                 writer.send(np.ascontiguousarray(frame))
+                sent += 1
         except OSError as error:
             raise UserError(f"{path}: the video cannot be encoded: {str(error).splitlines()[0]}") from error
         finally:
             writer.close()
+        if _count_frames(aside) != sent:
+            raise UserError(f"{path}: ffmpeg could not write the whole video; free disk space and try again")
+
+
+def _count_frames(video: Path) -> int:
+    """Number of frames of a video; 0 if it cannot be read. imageio-ffmpeg does not report ffmpeg's exit code."""
+    try:
+        return _ffmpeg().count_frames_and_secs(str(video))[0]
+    except (OSError, RuntimeError, subprocess.SubprocessError):
+        return 0
 
 
 def _write_folder(path: Path, frames: Frames) -> None:

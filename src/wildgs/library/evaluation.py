@@ -22,7 +22,7 @@ Scores = dict[Protocol, dict[str, Any]]
 
 def evaluate(
     run: str | Path | Run | LoadedScene,
-    protocols: Sequence[Protocol] = PROTOCOLS,
+    protocols: str | Sequence[str] = PROTOCOLS,
     *,
     scene: str | Path | Scene | None = None,
     lpips: str | Path | None = None,
@@ -39,16 +39,18 @@ def evaluate(
         progress: Called for every photo read and every view scored.
 
     Raises:
-        UserError: The run or a folder does not exist, the scene's photos are missing, or none is held out.
+        UserError: The run, a folder or a protocol does not exist, the scene's photos are missing, or none is held
+            out.
     """
     check_lpips(lpips)
+    chosen = _known_protocols(protocols)
     loaded = open_run(run)
     if not isinstance(scene, Scene):
         scene = read_run_scene(loaded, scene, progress)
     scores: Scores = {}
-    scored = "full" in protocols and scene.test_views
+    scored = "full" in chosen and scene.test_views
     photos = LoadedScene(loaded).photo_fits(scene=scene, progress=progress) if scored else []
-    for protocol in protocols:
+    for protocol in chosen:
         count = _ViewCounter(progress, f"scoring {loaded.config.method}, protocol {protocol}", scene)
         scores[protocol] = score_views(
             loaded.method,
@@ -63,6 +65,14 @@ def evaluate(
             on_view=count,
         )
     return scores
+
+
+def _known_protocols(protocols: str | Sequence[str]) -> Sequence[Protocol]:
+    given = [protocols] if isinstance(protocols, str) else protocols
+    for name in given:
+        if name not in PROTOCOLS:
+            raise UserError(f"unknown protocol {name!r}; choose {' or '.join(PROTOCOLS)}")
+    return [protocol for protocol in PROTOCOLS if protocol in given]
 
 
 def check_lpips(folder: str | Path | None) -> None:

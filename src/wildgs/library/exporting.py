@@ -48,7 +48,7 @@ def export(
     run: str | Path | LoadedScene,
     formats: ExportFormat | Sequence[ExportFormat] = "html",
     *,
-    appearance: Sequence[str | Path | Look] = (),
+    appearance: str | Path | Look | Sequence[str | Path | Look] = (),
     output: str | Path | None = None,
     title: str | None = None,
     aligned: bool = False,

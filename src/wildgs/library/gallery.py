@@ -52,7 +52,7 @@ def gallery(
     output: str | Path | None = None,
     *,
     views: Sequence[str] = (),
-    appearance: Sequence[str] = (),
+    appearance: str | Sequence[str] = (),
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> WrittenGallery:
@@ -74,7 +74,7 @@ def gallery(
     rows = [find_view(scene.scene, name) for name in views] or held_out[:: max(1, -(-len(held_out) // VIEWS))]
     if not rows:
         raise UserError(f"{scene.scene.root} has no photo with a camera")
-    specs = appearance or _default_lights(scene)
+    specs = ([appearance] if isinstance(appearance, str) else appearance) or _default_lights(scene)
     looks = find_looks(scene, specs, mixing, progress=progress)
     output = scene.run.folder / "gallery" if output is None else Path(output)
     single = output.suffix.lower() in FORMATS

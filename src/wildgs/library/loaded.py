@@ -247,7 +247,7 @@ def loaded(run: str | Path | LoadedScene) -> LoadedScene:
 
 def find_looks(
     scene: LoadedScene,
-    specs: Sequence[str | Path | Look],
+    specs: str | Path | Look | Sequence[str | Path | Look],
     mixing: MixOptions | None = None,
     *,
     progress: Progress | None = None,
@@ -256,7 +256,7 @@ def find_looks(
 
     Args:
         scene: The loaded scene.
-        specs: Anything that `LoadedScene.appearance` accepts.
+        specs: Anything that `LoadedScene.appearance` accepts, or several.
         mixing: How they are obtained and mixed.
         progress: Called during long work.
 
@@ -264,6 +264,8 @@ def find_looks(
         UserError: An appearance cannot be obtained, or the options contradict each other.
     """
     mixing = mixing or MixOptions()
+    if isinstance(specs, str | Path | Look):
+        specs = (specs,)
 
     def find(spec: str | Path | Look) -> Look:
         return scene.appearance(spec, like=mixing.like, progress=progress)

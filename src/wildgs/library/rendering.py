@@ -31,6 +31,7 @@ DEFAULT_PATH = "orbit"
 DEFAULT_FPS = 30.0
 DEFAULT_SECONDS, DAY_SECONDS = 5.0, 10.0
 MAX_FRAMES = 100_000
+MAX_FPS = 1000
 MAX_SIDE, MAX_PIXELS = 16_384, 2**27
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -62,8 +63,8 @@ def render(
     run: str | Path | LoadedScene,
     output: str | Path,
     *,
-    appearance: Sequence[Spec] = (NEUTRAL,),
-    to: Sequence[Spec] = (),
+    appearance: Spec | Sequence[Spec] = (NEUTRAL,),
+    to: Spec | Sequence[Spec] = (),
     over: Literal["day"] | None = None,
     photos: str | Path | None = None,
     views: Sequence[str] = (),
@@ -152,7 +153,7 @@ def check_size(width: int, height: int) -> None:
 def _render_views(
     scene: LoadedScene,
     output: Path,
-    appearance: Sequence[Spec],
+    appearance: Spec | Sequence[Spec],
     names: Sequence[str],
     size: tuple[int, int] | None,
     mixing: MixOptions | None,
@@ -217,17 +218,21 @@ def _find_cameras(
 ) -> tuple[list[Camera], float]:
     """Cameras and frames per second of the video."""
     kind = trajectory.path or ("views" if len(views) > 1 else DEFAULT_PATH)
-    fps = trajectory.fps or DEFAULT_FPS
+    fps = DEFAULT_FPS if trajectory.fps is None else trajectory.fps
+    if not 0 < fps <= MAX_FPS:
+        raise UserError(f"--fps {fps:g}: must be above 0 and at most {MAX_FPS:,}")
     if kind not in (*AROUND, *THROUGH) and Path(kind).suffix and trajectory.size is None:
+        if trajectory.seconds is not None:
+            raise UserError(f"{kind}: a camera file defines the number of its frames; leave --seconds out")
         cameras, file_fps = read_path(scene.scene, Path(kind))
         sizes = {(camera.width, camera.height) for camera in cameras}
         if len(sizes) > 1:
             raise UserError(f"{kind}: the cameras of a video must all have the same image size")
-        return cameras, trajectory.fps or file_fps
+        return cameras, file_fps if trajectory.fps is None else fps
     seconds = DEFAULT_SECONDS if trajectory.seconds is None else trajectory.seconds
-    if not (fps > 0 and seconds > 0 and seconds * fps <= MAX_FRAMES):
+    if not (seconds > 0 and seconds * fps <= MAX_FRAMES):
         raise UserError(
-            f"{seconds:g} seconds at {fps:g} frames per second: both must be above 0, and the video at most "
+            f"{seconds:g} seconds at {fps:g} frames per second: the length must be above 0, and the video at most "
             f"{MAX_FRAMES:,} frames long"
         )
     frames = max(1, round(seconds * fps))

@@ -23,6 +23,7 @@ from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.photos import PhotoFit, describe_misfits, inspect_photos, write_photos
+from wildgs.files import is_file
 from wildgs.library.logs import InterruptedTrainingError, StopOnSignal, logger, run_log
 from wildgs.light.photos import KeptAppearances
 from wildgs.progress import Progress, counter, silent
@@ -85,6 +86,8 @@ class _Job:
     progress: Progress
     observers: Sequence[Observer]
     attach: Sequence[Attachment]
+    again: str
+    """How the same command continues after an interruption: `again`, or `with --resume`."""
 
 
 def train(
@@ -126,9 +129,12 @@ def train(
     """
     folder, execution, team = Path(output), execution or ExecutionConfig(), team or Team()
     progress = progress or silent
+    if not is_file(folder / CONFIG_FILE):
+        _refuse_input(folder, scene.root if isinstance(scene, Scene) else Path(scene))
     with limited(execution.threads), ExitStack() as stack:
         if not locked:
             team.from_first(lambda: stack.enter_context(lock_run(folder)))
+        again = "again" if resume == "auto" else "with --resume"
         if resume == "auto":
             resume = team.from_first(lambda: (folder / CONFIG_FILE).is_file())
         if resume:
@@ -147,8 +153,16 @@ def train(
             with team.propagate_errors():
                 config = plan_memory(config, read, explicit=max_gaussians is not None)
             config = with_budget(config, team.least(config.train.density.max_gaussians))
-        job = _Job(folder, read, execution, team, progress, observers, attach)
+        job = _Job(folder, read, execution, team, progress, observers, attach, again)
         return _train_within_memory(job, config, resume=bool(resume))
+
+
+def _refuse_input(folder: Path, scene: Path) -> None:
+    """Raises `UserError` if the run would be written among the files of its scene."""
+    inputs = (scene, *(scene / part for part in ("images", "sparse", "masks", "depth")))
+    for place in (folder.resolve(), *folder.resolve().parents):
+        if any(place == part.resolve() for part in (inputs if place == folder.resolve() else inputs[1:])):
+            raise UserError(f"{folder}: contains the scene's own files; choose another --output for the run")
 
 
 def _resumed(folder: Path, stored: RunConfig, requested: RunConfig | None) -> RunConfig:
@@ -293,7 +307,7 @@ def _train_to_end(
         except InterruptedTrainingError as interrupt:
             team.from_first(lambda: _save_last(saver, writer, trainer.step, hurry=True))
             interrupt.args = (
-                f"{interrupt}, saved in {folder}; run the same command with --resume to continue",
+                f"{interrupt}, saved in {folder}; run the same command {job.again} to continue",
             )
             raise
         _save_last(saver, writer, trainer.step)

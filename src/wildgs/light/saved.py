@@ -12,7 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.files import written_aside
+from wildgs.files import is_there, written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
 from wildgs.model.method import Method
@@ -30,12 +30,15 @@ def save_look(look: Look, file: Path) -> Path:
     all the same outside the triplane's box).
 
     Raises:
-        UserError: The run cannot be relit, the extension is wrong, or the file cannot be written.
+        UserError: The run cannot be relit, the extension is wrong, the file exists and is not an appearance, or it
+            cannot be written.
     """
     if not look.method.relightable:
         raise UserError(f"{look.method.label} cannot be relit; there is no appearance to save")
     if file.suffix != SUFFIX:
         raise UserError(f"{file}: the name of an appearance file must end in {SUFFIX}")
+    if is_there(file) and not _is_appearance(file):
+        raise UserError(f"{file} exists and is not an appearance file; choose another name")
     tensors = _packed(look.embeddings)
     if look.sky is not None:
         tensors |= {f"{SKY}{name}": values for name, values in _packed(look.sky.embeddings).items()}
@@ -43,6 +46,16 @@ def save_look(look: Look, file: Path) -> Path:
     with written_aside(file) as aside:
         aside.write_bytes(save(tensors, metadata={"wildgs": json.dumps(header)}))
     return file
+
+
+def _is_appearance(file: Path) -> bool:
+    """Whether a file is an appearance, of any version and any run."""
+    try:
+        with safe_open(file, framework="pt") as opened:
+            header = json.loads((opened.metadata() or {}).get("wildgs", "{}"))
+        return str(header.get("format", "")).startswith(FORMAT.rstrip("0123456789"))
+    except (OSError, ValueError, AttributeError, SafetensorError):
+        return False
 
 
 def load_look(method: Method, file: Path) -> Look:

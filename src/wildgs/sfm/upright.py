@@ -68,12 +68,22 @@ def list_photos(folder: Path) -> list[str]:
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; give the folder of the photos")
-    names, others = [], []
+    names, others, broken = [], [], []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if any(part.startswith(".") for part in PurePosixPath(name).parts) or path.is_dir():
             continue
-        (names if is_file(path) and _is_photo(path) else others).append(name)
+        if path.is_symlink() and not path.exists():
+            broken.append(name)
+        else:
+            (names if is_file(path) and _is_photo(path) else others).append(name)
+    if broken:
+        warnings.warn(
+            f"{folder}: {len(broken)} links point to files that do not exist; connect their drive, or remove them:"
+            f" {describe_names([printable(name) for name in broken])}",
+            WildGSWarning,
+            stacklevel=2,
+        )
     if not names:
         raise UserError(f"{folder}: no photos (.jpg, .png, .tif, .webp, ...) in this folder; give another")
     if others:
