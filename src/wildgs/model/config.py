@@ -277,7 +277,7 @@ class WildGSConfig:
     color_match: bool = True
     matched_loss: float = 0.8
     camera_response: CameraResponseConfig = field(default_factory=CameraResponseConfig)
-    light_codes: int = 8
+    light_codes: int = 16
     light_components: int = 32
     embedding_noise: float = 0.0
     eps2d: float = 0.1
