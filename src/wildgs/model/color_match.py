@@ -23,6 +23,9 @@ ROUNDS, TRAINING_ROUNDS = 6, 3
 """Iterations of iteratively reweighted least squares."""
 RIDGE = 3e-4
 """Ridge regularisation of the least squares, in units of mean squared colour."""
+SKY_RIDGE = 3e-3
+"""The same for all but the constant of an encoded photo's sky. A weaker one gave directions that the photo does not
+show another hue: pink sky beside a blue one."""
 OUTLIER = 0.05
 """Residual at which a pixel's weight is halved (Cauchy weights), for passers-by that the mask has missed."""
 LEAST_PIXELS = 64
@@ -30,7 +33,7 @@ LEAST_PIXELS = 64
 
 PRIOR_ELEVATIONS = torch.linspace(-1, 1, 9)
 """Sines of elevations at which an encoded photo's sky is assumed not to change, unless the photo shows it."""
-PRIOR_SHARE = 0.002
+PRIOR_SHARE = 0.02
 """Weight of this assumption relative to that of the photo's sky pixels."""
 
 ELEVATION_ORDERS = 2
@@ -186,7 +189,8 @@ def _fitted(
         photo: Colours of the photo.
         regions: For each region, weights of the pixels, and further terms, the first of which is 1.
         training: Whether A is diagonal.
-        fixed: Number of last pixels whose weights are not reduced, whatever their residual.
+        fixed: Number of last pixels, of `_with_prior`, whose weights are not reduced, whatever their residual. If
+            there are any, the second region is the sky of an encoded photo.
     """
     sizes = [further.shape[-1] for _, further in regions]
     weights = torch.stack([weight.reshape(-1) for weight, _ in regions])
@@ -204,6 +208,9 @@ def _fitted(
     table = torch.where(counts[:, None, :, None], torch.cat(columns, dim=3), 0).double()
     terms, residuals = table[..., :-own], table[..., -own:]
     ridge = RIDGE * torch.eye(terms.shape[3], table.shape[3], dtype=table.dtype, device=table.device)
+    if fixed:
+        ridge = torch.stack([ridge, ridge * SKY_RIDGE / RIDGE])[:, None]
+        ridge[1, 0, own, own] = RIDGE
     base = torch.where(counts, weights, 0).double()
     change, trusted = table.new_zeros(()), base
     for round_ in range(rounds := TRAINING_ROUNDS if training else ROUNDS):
