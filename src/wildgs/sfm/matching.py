@@ -23,7 +23,10 @@ from wildgs.sfm.workplace import Workplace
 
 EXTRACTION_BATCH = 16
 MATCHING_BLOCK = 50
-"""Photos per block of pairs; COLMAP keeps the features of two blocks in memory."""
+"""Photos per block of pairs, in which pairs are sorted so that few photos' features are needed at a time."""
+MATCHING_FEATURES = 1_500_000
+"""Upper bound on the features of all photos in one call of COLMAP, which keeps them and their search structures in
+memory: about 700 bytes per feature."""
 
 TOLERANT_RATIO = 0.85
 """Lowe's ratio in later passes; 0.8 in the first."""
@@ -129,7 +132,9 @@ def match(
         for photo, copy in enumerate(copies)
         if photo in rows and (position := copy.position) is not None
     }
-    chosen = choose_pairs(vlads[kept], positions, config.pairing, _count_features(work, copies, kept))
+    chosen = choose_pairs(
+        vlads[kept], positions, config.pairing, sum(_feature_counts(work, [copies[photo] for photo in kept]))
+    )
     pairs = {(kept[a], kept[b]) for a, b in chosen.pairs}
     match_pairs(
         work,
@@ -141,11 +146,11 @@ def match(
     return Pairing(chosen.name, tuple(sorted(pairs | twins))), crops
 
 
-def _count_features(work: Workplace, copies: Sequence[WorkingCopy], photos: Collection[int]) -> int:
+def _feature_counts(work: Workplace, copies: Sequence[WorkingCopy]) -> list[int]:
+    """Number of features of each photo; 0 for photos that COLMAP could not read."""
     with closing(pycolmap.Database.open(work.database)) as database:
         ids = image_ids(database, copies)
-        known = [image_id for photo in photos if (image_id := ids[photo]) is not None]
-        return sum(database.num_keypoints_for_image(image_id) for image_id in known)
+        return [0 if known is None else database.num_keypoints_for_image(known) for known in ids]
 
 
 def match_pairs(
@@ -185,9 +190,10 @@ def match_pairs(
     # Sorted by blocks of photos, so that features are read once per block.
     ordered = sorted(pairs, key=lambda pair: (pair[0] // MATCHING_BLOCK, pair[1] // MATCHING_BLOCK, pair))
     step = max(50, min(MATCHING_BLOCK**2, len(ordered) // 20))
-    for start in range(0, len(ordered), step):
-        progress(start, len(ordered))
-        chunk = ordered[start : start + step]
+    done = 0
+    for chunk in chunks_of_pairs(ordered, _feature_counts(work, copies), step):
+        progress(done, len(ordered))
+        done += len(chunk)
         lists.write_text("".join(f"{copies[a].work_name} {copies[b].work_name}\n" for a, b in chunk))
         pycolmap.match_image_pairs(
             work.database,
@@ -202,6 +208,27 @@ def match_pairs(
                 remove_captions(database, [(a, b) for a, b in known if a and b], verification)
     if ordered:
         progress(len(ordered), len(ordered))
+
+
+def chunks_of_pairs(pairs: Sequence[Pair], features: Sequence[int], most: int) -> Iterator[list[Pair]]:
+    """Cuts pairs into chunks whose photos together have at most `MATCHING_FEATURES` features; a pair is not cut.
+
+    Args:
+        pairs: Pairs in the order in which they are matched.
+        features: Number of features of each photo.
+        most: Upper bound on the pairs of a chunk.
+    """
+    chunk: list[Pair] = []
+    photos: set[int] = set()
+    for pair in pairs:
+        grown = photos | set(pair)
+        if chunk and (len(chunk) == most or sum(features[photo] for photo in grown) > MATCHING_FEATURES):
+            yield chunk
+            chunk, grown = [], set(pair)
+        chunk.append(pair)
+        photos = grown
+    if chunk:
+        yield chunk
 
 
 def forget_pairs(work: Workplace, copies: Sequence[WorkingCopy], pairs: Collection[Pair]) -> None:
