@@ -94,7 +94,7 @@ def test_stop_then_lose_a_rank_then_go_on_alone(landmark: Path, tmp_path: Path, 
     assert line.startswith(f"interrupted at step {step}")
     assert step % 2 == 0
     assert output.count("training 3dgs on 2 processes: 400 steps") == 1
-    assert output.count("test photos,") == 1
+    assert output.count("held-out photos,") == 1
 
     process = torchrun("train", landmark, "--output", run, "--resume", *TRAIN[-2:])
     wait_for_checkpoint(process, run, step + 20)

@@ -37,7 +37,8 @@ def test_densification_can_be_switched_off() -> None:
     ["densify_every", "reset_every", "first_stage", "sh_every", "encoder_every", "mask_every", "mask_visits"],
 )
 def test_impossible_steps_are_one_line(name: str) -> None:
-    with pytest.raises(UserError, match=rf"schedule\.{name} -1: must be"):
+    option = name.replace("_", "-")
+    with pytest.raises(UserError, match=rf"--schedule\.{option} -1: must be"):
         ScheduleConfig(**{name: -1})
     if name in ("sh_every", "encoder_every", "mask_every"):
         with pytest.raises(UserError, match="must be 1 or more"):

@@ -33,7 +33,7 @@ LEAST_PIXELS = 64
 
 PRIOR_ELEVATIONS = torch.linspace(-1, 1, 9)
 """Sines of elevations at which an encoded photo's sky is assumed not to change, unless the photo shows it."""
-PRIOR_SHARE = 0.02
+PRIOR_SHARE = 0.007
 """Weight of this assumption relative to that of the photo's sky pixels."""
 
 ELEVATION_ORDERS = 2
