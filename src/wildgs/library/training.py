@@ -159,10 +159,10 @@ def train(
 
 def _refuse_input(folder: Path, scene: Path) -> None:
     """Raises `UserError` if the run would be written among the files of its scene."""
-    inputs = (scene, *(scene / part for part in ("images", "sparse", "masks", "depth")))
-    for place in (folder.resolve(), *folder.resolve().parents):
-        if any(place == part.resolve() for part in (inputs if place == folder.resolve() else inputs[1:])):
-            raise UserError(f"{folder}: contains the scene's own files; choose another --output for the run")
+    place = folder.resolve()
+    inputs = [(scene / part).resolve() for part in ("images", "sparse", "masks", "depth")]
+    if place == scene.resolve() or any(place.is_relative_to(part) for part in inputs):
+        raise UserError(f"{folder}: contains the scene's own files; choose another --output for the run")
 
 
 def _resumed(folder: Path, stored: RunConfig, requested: RunConfig | None) -> RunConfig:

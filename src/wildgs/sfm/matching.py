@@ -220,13 +220,16 @@ def chunks_of_pairs(pairs: Sequence[Pair], features: Sequence[int], most: int) -
     """
     chunk: list[Pair] = []
     photos: set[int] = set()
+    held = 0
     for pair in pairs:
-        grown = photos | set(pair)
-        if chunk and (len(chunk) == most or sum(features[photo] for photo in grown) > MATCHING_FEATURES):
+        added = sum(features[photo] for photo in set(pair) - photos)
+        if chunk and (len(chunk) == most or held + added > MATCHING_FEATURES):
             yield chunk
-            chunk, grown = [], set(pair)
+            chunk, photos, held = [], set(), 0
+            added = sum(features[photo] for photo in set(pair))
         chunk.append(pair)
-        photos = grown
+        photos.update(pair)
+        held += added
     if chunk:
         yield chunk
 
