@@ -5,8 +5,8 @@
     wildgs train gate10-stereo --output run --steps 1500 --downscale 2 --density.max-gaussians 40000
 
 The study trains with `--parsing.max-side 192` as well. Training photos are those with the numbers
-round((n - 1) i / (photos - 1)) of n; all test photos stay, and `depth/` is left out. Points that fewer than two of the
-chosen photos observe are removed (`--all-points` keeps them), as are observations by other photos.
+round((n - 1) i / (photos - 1)) of n; all test photos stay, and `depth/` is left out. Points that fewer than two of
+the chosen photos observe are removed (`--all-points` keeps them), as are observations by other photos.
 """
 
 from __future__ import annotations
