@@ -155,6 +155,21 @@ def test_light_that_follows_the_codes_is_found() -> None:
         torch.testing.assert_close(changed_colors(render, found, None, codes), photo, atol=0.01, rtol=0)
 
 
+def test_codes_are_shrunk_more_in_training() -> None:
+    """Three times the ridge: what faint codes seem to explain may be passers-by."""
+    generator = torch.Generator().manual_seed(0)
+    render = torch.rand(40, 50, 3, generator=generator)
+    codes = 0.02 * torch.randn(40, 50, 1, generator=generator)
+    photo = render + 0.5 * codes
+    kept = [
+        float(match_colors(render, photo, torch.ones(40, 50), training, codes)[0, 4]) / 0.5
+        for training in (False, True)
+    ]
+    variance = 0.02**2
+    assert kept[0] == pytest.approx(variance / (variance + 3e-4), abs=0.05)
+    assert kept[1] == pytest.approx(variance / (variance + 9e-4), abs=0.05)
+
+
 def test_in_training_channels_do_not_mix() -> None:
     """However little a render's hue says about the photo's, the match must not take it away."""
     generator = torch.Generator().manual_seed(0)

@@ -23,6 +23,8 @@ ROUNDS, TRAINING_ROUNDS = 6, 3
 """Iterations of iteratively reweighted least squares."""
 RIDGE = 3e-4
 """Ridge regularisation of the least squares, in units of mean squared colour."""
+CODE_RIDGE = 9e-4
+"""The same for all but gain and offset in training. With a weaker one, light codes represent some passers-by."""
 SKY_RIDGE = 3e-3
 """The same for all but the constant of an encoded photo's sky. A weaker one gave directions that the photo does not
 show another hue: pink sky beside a blue one."""
@@ -208,6 +210,8 @@ def _fitted(
     table = torch.where(counts[:, None, :, None], torch.cat(columns, dim=3), 0).double()
     terms, residuals = table[..., :-own], table[..., -own:]
     ridge = RIDGE * torch.eye(terms.shape[3], table.shape[3], dtype=table.dtype, device=table.device)
+    if training:
+        ridge[own + 1 :] *= CODE_RIDGE / RIDGE
     if fixed:
         ridge = torch.stack([ridge, ridge * SKY_RIDGE / RIDGE])[:, None]
         ridge[1, 0, own, own] = RIDGE
