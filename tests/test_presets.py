@@ -39,6 +39,7 @@ MENDED = {
     "model.antialiased": False,
     "model.light_components": 0,
     "model.matched_loss": 0.0,
+    "model.embedding_scale": 1.0,
     "train.objective.depth_weight": 0.05,
     "train.objective.metric_weight": 0.0,
     "train.objective.sky_weight": 0.0,

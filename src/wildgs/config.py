@@ -51,6 +51,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "model.light_codes": (0, 64),
     "model.light_components": (0, 256),
     "model.embedding_noise": (0, 10),
+    "model.embedding_scale": (0, 1),
     "model.eps2d": (0.01, 10),
     "model.parsing.max_side": (16, 4096),
     "model.parsing.global_size": (1, 1024),

@@ -10,6 +10,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "camera_response"): ("color_match", {"vignetting": False, "curve": False}),
     ("model", "light_codes"): ("color_match", 0),
     ("model", "light_components"): ("color_match", 0),
+    ("model", "embedding_scale"): ("color_match", 1.0),
     ("model", "local_embeddings"): ("wrapping", True),
     ("model", "eps2d"): ("wrapping", 0.3),
     ("model", "antialiased"): ("wrapping", False),

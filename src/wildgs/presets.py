@@ -47,6 +47,7 @@ _PAPER: dict[str, Any] = {
     "model.light_codes": 0,
     "model.light_components": 0,
     "model.matched_loss": 0.0,
+    "model.embedding_scale": 1.0,
     "model.eps2d": 0.3,
     "model.antialiased": False,
     "train.objective.depth_weight": 0.05,

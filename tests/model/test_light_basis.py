@@ -122,6 +122,33 @@ def test_a_new_photos_light_is_fitted(camera, lit: WildGS) -> None:
     assert lit.encode(photo, camera, trust_mask=False).basis_weights is None
 
 
+def test_encoded_photos_keep_a_part_of_their_embedding(camera, lit: WildGS) -> None:
+    photo = photo_under(camera, 0.7, 0.3)
+    whole = lit.parse(photo).global_embedding
+    assert whole is not None
+    for scale in (0.5, 1.0):
+        lit.config = replace(lit.config, embedding_scale=scale)
+        torch.testing.assert_close(lit.encode(photo, camera).global_embedding, scale * whole)
+    lit.config = replace(lit.config, embedding_scale=0.5, color_match=False)
+    assert torch.equal(lit.encode(photo, camera).global_embedding, whole), (
+        "no match replaces what is taken away"
+    )
+
+
+def test_the_basis_is_that_of_whole_embeddings(camera, lit: WildGS) -> None:
+    photos = [
+        SeenPhoto(photo_under(camera, a, 1 - a), camera, None, str(a)) for a in (0.0, 0.3, 0.5, 0.8, 1.0)
+    ]
+    with torch.no_grad():
+        lit.fusion.output.weight.normal_(generator=torch.Generator().manual_seed(0))
+    found = []
+    for scale in (0.5, 1.0):
+        lit.config = replace(lit.config, embedding_scale=scale)
+        lit.finish(photos)
+        found.append(lit.light_basis.components)
+    assert torch.equal(*found)
+
+
 def test_pixels_that_do_not_count_are_not_read(camera, lit: WildGS) -> None:
     photo = photo_under(camera, 1, 0)
     look = replace(lit.encode(photo, camera), visibility=None)

@@ -258,6 +258,8 @@ class WildGSConfig:
             (`wildgs.model.light_basis`); 0 = none. Not in the paper.
         embedding_noise: Relative standard deviation of random noise on the global embedding in training, so that
             the networks do not memorise the light of single photos; 0.2 helps some long runs. Not in the paper.
+        embedding_scale: Factor on the global embedding when a photo is encoded for the colour match, 0 to 1, since
+            long training memorises the embeddings of training photos. Not in the paper.
         eps2d: Added to the diagonal of projected 2D covariances, in square pixels. 3DGS uses 0.3, which blurs
             pixel-sized detail.
         antialiased: Compensate for `eps2d` in opacities (gsplat's antialiased mode), so that renders of other sizes
@@ -280,6 +282,7 @@ class WildGSConfig:
     light_codes: int = 16
     light_components: int = 32
     embedding_noise: float = 0.0
+    embedding_scale: float = 0.5
     eps2d: float = 0.1
     antialiased: bool = True
     learning_rates: WildGSRates = field(default_factory=WildGSRates)

@@ -182,9 +182,7 @@ class WildGS(Method):
     def finish(self, photos: Iterable[SeenPhoto]) -> None:
         """Computes the light basis."""
         self.light_basis.components = None  # otherwise the lights would be fitted in the previous basis
-        lights = (
-            self.shade(self.encode(seen.photo, seen.camera, seen.keep, name=seen.name)) for seen in photos
-        )
+        lights = (self.shade(self._learned_appearance(seen)) for seen in photos)
         self.light_basis.learn(lights, self.gaussians, self.config.light_components)
 
     def encode(
@@ -203,13 +201,42 @@ class WildGS(Method):
             return appearance
         if not trust_mask:
             appearance = replace(appearance, visibility=None)
-        with torch.no_grad():
-            projection = self.gaussians.project(camera)
-        if self._wraps:
-            appearance = self.wrap(photo, appearance, projection, keep)
+        appearance = self._wrapped(photo, camera, keep, appearance)
         # Without trust in the mask, the image shows another scene, so that comparing pixels is meaningless.
         if not (self.config.color_match and trust_mask):
             return appearance
+        assert appearance.global_embedding is not None
+        embedding = self.config.embedding_scale * appearance.global_embedding
+        return self._match(photo, camera, keep, replace(appearance, global_embedding=embedding))
+
+    def _learned_appearance(self, seen: SeenPhoto) -> Appearance:
+        """`encode` of a training photo with all of its embedding, as in training."""
+        photo, camera, keep = seen.photo, seen.camera, seen.keep
+        appearance = self._wrapped(photo, camera, keep, self.parse(photo))
+        return self._match(photo, camera, keep, appearance) if self.config.color_match else appearance
+
+    def _wrapped(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None,
+        appearance: Appearance,
+    ) -> Appearance:
+        """Adds the triplane to an appearance from `parse`, if there are local embeddings."""
+        if not self._wraps:
+            return appearance
+        with torch.no_grad():
+            projection = self.gaussians.project(camera)
+        return self.wrap(photo, appearance, projection, keep)
+
+    def _match(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        camera: Camera,
+        keep: Bool[Tensor, "H W"] | None,
+        appearance: Appearance,
+    ) -> Appearance:
+        """Adds colour match, light basis and camera response to a predicted appearance."""
         sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
         with torch.no_grad():
             colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
