@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from wildgs.config import RunConfig, differing_entries, from_plain, to_plain, with_entries
+from wildgs.config import RunConfig, differing_entries, from_plain, to_plain, validated, with_entries
 from wildgs.errors import UserError
 from wildgs.model.config import VanillaConfig, VanillaRates, WildGSRates, WrappingConfig
 
@@ -50,6 +53,33 @@ def test_changes_what_it_names_and_nothing_else():
 def test_what_does_not_exist_or_fit_is_named(entries, said):
     with pytest.raises(UserError, match=said):
         with_entries(BASE, entries)
+
+
+def unchecked(group: str, name: str, value: object) -> RunConfig:
+    """The configuration that a user gets where no type is checked; the tests' import hook checks them."""
+    config = copy.deepcopy(BASE)
+    object.__setattr__(getattr(config, group), name, value)
+    return config
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value", "said"),
+    [
+        ("train", "steps", 3e1, "train.steps: 30.0 is not a int"),
+        ("data", "use_masks", "false", "data.use_masks"),
+        ("data", "holdout", False, "data.holdout"),
+        ("train", "precision", "foo", "train.precision"),
+    ],
+)
+def test_values_of_another_type_are_named_before_they_are_used(group, name, value, said):
+    with pytest.raises(UserError, match=said):
+        validated(unchecked(group, name, value))
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert validated(unchecked("train", "steps", np.int64(5))).train == replace(BASE.train, steps=5)
+    assert validated(unchecked("data", "downscale", np.float64(2))).data == replace(BASE.data, downscale=2.0)
+    assert validated(BASE) == BASE
 
 
 def test_files_of_earlier_versions_open():

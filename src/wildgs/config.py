@@ -9,7 +9,7 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import yaml
 import yaml.composer
@@ -153,13 +153,27 @@ class RunConfig:
         return self if method == self.method else dataclasses.replace(self, method=method, model=None)
 
 
+ConfigT = TypeVar("ConfigT")
+
+
 def to_plain(value: Any) -> Any:
     """Converts a configuration to dicts, lists, strings and numbers."""
+    if type(value).__module__ == "numpy":  # np.float32(2), for example
+        return value.item()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, (tuple, list)):
         return [to_plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def validated(config: ConfigT) -> ConfigT:
+    """A configuration from Python, with entries of the annotated types, as if it had been read from a file.
+
+    Raises:
+        UserError: An entry has another type, for example a float where an integer is expected.
+    """
+    return from_plain(type(config), to_plain(config), type(config).__name__)
 
 
 def from_plain(kind: Any, value: Any, where: str = "config") -> Any:

@@ -19,7 +19,7 @@ from wildgs.library.day import known_day
 from wildgs.library.doctor import write_report
 from wildgs.library.logs import run_log
 from wildgs.light.photos import encode_view
-from wildgs.runs import CONFIG_FILE, load_run, prepare_training, require_same_scene
+from wildgs.runs import CONFIG_FILE, WRITTEN, load_run, prepare_training, refuse_trained, require_same_scene
 from wildgs.scene import load_scene
 from wildgs.scene.carried import LIGHTS_FOLDER, SCENE_FILE
 
@@ -224,3 +224,14 @@ def test_a_file_that_is_written_again_gives_its_new_light(trained: Path, tmp_pat
     Image.new("RGB", (40, 30), (10, 10, 60)).save(file)
     os.utime(file, ns=(1, 1))
     assert scene.appearance(file, like=like) is not bright
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_folder_with_files_of_somebody_else_is_no_output(tmp_path: Path, name: str) -> None:
+    (tmp_path / "holiday.txt").touch()
+    refuse_trained(tmp_path)
+    (tmp_path / name).touch()
+    with pytest.raises(UserError, match=f"{name} belongs to no run"):
+        refuse_trained(tmp_path)
+    (tmp_path / CONFIG_FILE).touch()  # of a run that was stopped before its first checkpoint
+    refuse_trained(tmp_path)

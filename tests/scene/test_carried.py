@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from tests.memory_views import make_view
-from wildgs.errors import UserError
+from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.scene import Alignment, DataConfig, Scene, load_scene
 from wildgs.scene import carried as module
@@ -254,7 +254,8 @@ def test_photos_that_differ_by_their_ending_share_nothing(make_scene: MakeScene)
     Image.fromarray(codes).save(root / "depth" / "a.png")
     mask = Image.fromarray(np.tri(32, 48, dtype=np.uint8))
     mask.save(root / "masks" / "a.png")
-    first, second, _ = load_scene(root, DataConfig(holdout=0)).views
+    with pytest.warns(WildGSWarning, match=r"depth: 1 files .* not used: a\.png"):
+        first, second, _ = load_scene(root, DataConfig(holdout=0)).views
     assert float(first.read_disparity().max()) == 1  # pyright: ignore[reportOptionalMemberAccess]
     assert float(second.read_disparity().max()) == pytest.approx(1 / 3, abs=1e-4)  # pyright: ignore
     assert first.read_mask() is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from wildgs.scene import images
 from wildgs.scene.images import (
     ShapeMismatchError,
     UnreadableImageError,
@@ -129,6 +130,17 @@ def test_cmyk_jpeg(tmp_path: Path) -> None:
     difference = read_photo(tmp_path / "a.jpg").pixels.astype(int) - gradient()
     assert np.abs(difference).max() < 24
     assert np.abs(difference).mean() < 3
+
+
+def test_heic_of_iphones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed")
+    heif.from_pillow(Image.fromarray(gradient())).save(tmp_path / "IMG_0.HEIC", quality=95)
+    difference = read_photo(tmp_path / "IMG_0.HEIC").pixels.astype(int) - gradient().astype(int)
+    assert np.abs(difference).mean() < 4
+    monkeypatch.setattr(images, "_register_heif", lambda: False)
+    monkeypatch.setattr(images, "FORMATS", ("JPEG",))
+    with pytest.raises(UnreadableImageError, match="pip install pillow-heif"):
+        open_image(tmp_path / "IMG_0.HEIC")
 
 
 def test_palette(tmp_path: Path) -> None:

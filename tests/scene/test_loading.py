@@ -56,6 +56,13 @@ def test_every_layout_gives_the_same_scene(
     assert view.read_truth_mask() is None
 
 
+def test_text_models_may_begin_with_a_byte_order_mark(make_scene: MakeScene) -> None:
+    root = make_scene(3, binary=False)
+    for file in (root / "sparse/0").glob("*.txt"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    assert len(load_scene(root).views) == 3
+
+
 def test_points_project_where_colmap_projects_them(make_scene: MakeScene) -> None:
     root = make_scene(5)
     scene = load_scene(root, DataConfig(downscale=2))
@@ -168,6 +175,24 @@ def test_distorted_photos_are_undistorted_like_colmap_does(make_scene: MakeScene
     difference = view.read_photo().numpy().astype(int) - expected.to_array().astype(int)
     assert np.abs(difference)[1:-1, 1:-1].max() <= 2
     assert sorted(root.rglob("*")) == before  # nothing is written into the scene
+
+
+@pytest.mark.parametrize(
+    ("model", "further"),
+    [("SIMPLE_FISHEYE", []), ("FISHEYE", [40.0]), ("OPENCV_FISHEYE", [40.0, 0, 0, 0, 0])],
+)
+def test_a_fisheye_without_coefficients_is_no_pinhole(model: str, further: list[float]) -> None:
+    params = [40.0, *further[:1], 24.0, 16.0, *further[1:]]
+    camera = pycolmap.Camera(model=model, width=W, height=H, params=params)
+    source = PixelGrid.from_colmap(camera).source()
+    assert source is not None
+    grid = PixelGrid.from_colmap(camera)
+    ray = torch.tensor([0.4, 0.0, 1.0], dtype=torch.float64)
+    column = (grid.K @ ray)[0] / ray[2] - 0.5
+    row = grid.K[1, 2] - 0.5
+    in_photo = source[round(float(row)), round(float(column))]
+    expected = 40 * np.arctan(0.4) + 24 - 0.5
+    assert abs(in_photo[1] - expected) < 1
 
 
 def test_masks_depth_and_truth_are_undistorted_with_the_photo(make_scene: MakeScene) -> None:
@@ -439,6 +464,16 @@ def test_a_mask_may_have_the_photos_own_name(make_scene: MakeScene) -> None:
     assert mask is not None
     assert not mask.any()
     assert second.read_mask() is None
+
+
+def test_depth_may_have_the_photos_whole_name(make_scene: MakeScene) -> None:
+    root = make_scene(names=["a.png", "b.jpg", "b.png"])
+    (root / "depth").mkdir()
+    for name in ("a.png.png", "b.png.png", "b.png"):
+        Image.fromarray(np.full((H, W), 65535, dtype=np.uint16)).save(root / "depth" / name)
+    with pytest.warns(WildGSWarning, match=r"depth: 1 files .* not used: b\.png"):
+        views = load_scene(root).views
+    assert [view.read_disparity() is not None for view in views] == [True, False, True]
 
 
 @pytest.mark.parametrize("folder", ["masks", "depth"])

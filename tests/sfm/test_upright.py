@@ -183,3 +183,14 @@ def test_links_to_nothing_are_named(tmp_path: Path) -> None:
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
     with pytest.warns(WildGSWarning, match="1 links point to files that do not exist.*gone.jpg"):
         assert list_photos(tmp_path) == ["a.jpg"]
+
+
+def test_links_to_folders_are_followed_once(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
+    folder.mkdir()
+    (elsewhere / ".hidden").mkdir(parents=True)
+    for path in (folder / "a.jpg", elsewhere / "b.jpg", elsewhere / ".hidden/c.jpg"):
+        Image.new("RGB", (8, 8)).save(path)
+    (folder / "holiday").symlink_to(elsewhere, target_is_directory=True)
+    (elsewhere / "back").symlink_to(folder, target_is_directory=True)
+    assert list_photos(folder) == ["a.jpg", "holiday/b.jpg"]

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from wildgs import processes
-from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.config import ExecutionConfig, RunConfig, validated
 from wildgs.engine.checkpoint import list_checkpoints
 from wildgs.engine.distributed import assign_device
 from wildgs.engine.report import Observer
@@ -122,7 +122,7 @@ def benchmark(
     request = _Request(Path(output), suite, variants, lpips, execution, progress, observers, announce)
     if processes.world_size() > 1:
         assign_device()
-    base = config or RunConfig()
+    base = validated(config or RunConfig())
     methods = default_bench_methods(suite) if methods is None else methods
     jobs = _plan(request, [Path(s) for s in scenes], base, methods, seeds)
     bench = _Bench(request, jobs)

@@ -14,7 +14,15 @@ from typing import Literal
 import torch
 
 from wildgs import features
-from wildgs.config import BUDGET, CONFIG_FILE, ExecutionConfig, RunConfig, differing_entries, read_config
+from wildgs.config import (
+    BUDGET,
+    CONFIG_FILE,
+    ExecutionConfig,
+    RunConfig,
+    differing_entries,
+    read_config,
+    validated,
+)
 from wildgs.engine.autosave import Autosave, CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder
@@ -127,7 +135,8 @@ def train(
             training diverged.
         InterruptedTrainingError: A signal arrived; the last step is saved.
     """
-    folder, execution, team = Path(output), execution or ExecutionConfig(), team or Team()
+    folder, execution, team = Path(output), validated(execution or ExecutionConfig()), team or Team()
+    config = None if config is None else validated(config)
     progress = progress or silent
     if not is_file(folder / CONFIG_FILE):
         _refuse_input(folder, scene.root if isinstance(scene, Scene) else Path(scene))

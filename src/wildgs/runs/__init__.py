@@ -25,10 +25,12 @@ from wildgs.model.registry import create_method, restore_method
 from wildgs.progress import Counter
 from wildgs.runs.scenes import CHECKPOINT_FOLDER, adopt_scene, carried_record, require_same_scene
 from wildgs.scene import Alignment, Scene, load_scene
-from wildgs.scene.carried import SCENE_FILE, carry_scene, read_carried_scene
+from wildgs.scene.carried import LIGHTS_FOLDER, SCENE_FILE, carry_scene, read_carried_scene
 from wildgs.scene.scene_record import SceneRecord
 
 LOCK_FILE = ".lock"
+WRITTEN = (SCENE_FILE, LIGHTS_FOLDER, "metrics.jsonl", "photos.json", "eval")
+"""Files and folders that training or scoring a run would overwrite."""
 
 
 def default_device() -> torch.device:
@@ -200,12 +202,18 @@ def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | 
 
 
 def refuse_trained(folder: Path) -> None:
-    """Raises `UserError` if a folder already contains a run, or checkpoints cannot be written to it."""
+    """Raises `UserError` if a folder already contains a run or files that a run would overwrite."""
     checkpoints = folder / CHECKPOINT_FOLDER
     if checkpoints.exists() and not checkpoints.is_dir():
         raise UserError(f"{checkpoints} is not a folder: move it away, or choose another --output")
     if list_checkpoints(checkpoints):
         raise UserError(f"{folder} already holds a run; add --resume to continue, or choose another --output")
+    if not (folder / CONFIG_FILE).exists():
+        for name in WRITTEN:
+            if (folder / name).exists():
+                raise UserError(
+                    f"{folder / name} belongs to no run; move it away, or choose another --output"
+                )
 
 
 def prepare_training(

@@ -40,7 +40,7 @@ def read_text(folder: Path) -> ModelRecords:
 
 def _check_count(path: Path, found: int) -> None:
     """Warns if a file's comment declares more entries than it has, the only sign of a truncated text file."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         head = "".join(line for line in itertools.islice(file, 5) if line.startswith("#"))
     declared = re.search(r"Number of \w+: (\d{1,12})", head)
     if declared is not None and int(declared[1]) > found:
@@ -55,7 +55,7 @@ def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[str, str]]
     """Yields (location, line) of all lines except comments; bytes that are not UTF-8 are preserved."""
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ModelFileError(f"{path.name}: larger than the limit of {MAX_FILE_BYTES} bytes")
-    with path.open(encoding="utf-8", errors="surrogateescape") as file:
+    with path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
         for number, line in enumerate(file, start=1):
             stripped = line.strip()
             if not stripped.startswith("#") and (stripped or keep_empty):

@@ -5,9 +5,11 @@ Colours keep the photo's encoding, usually sRGB.
 
 from __future__ import annotations
 
+import functools
+import importlib
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +33,8 @@ TRANSPOSITIONS = {
 """Transposition for each EXIF orientation that makes an image upright."""
 ASPECT_TOLERANCE = 0.01
 """Largest relative difference between aspect ratios of sizes with the same shape (besides rounding to pixels)."""
-
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+"""First bytes of HEIC and HEIF files after `ftyp`; AVIF has others."""
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000", "AVIF", "HEIF")
 """Formats that are decoded, whatever the file's extension. Some others of Pillow start programs (EPS:
 Ghostscript)."""
@@ -130,7 +133,7 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
     except FileNotFoundError as error:
         raise UnreadableImageError("no such file") from error
     except UnidentifiedImageError as error:
-        raise UnreadableImageError("not a readable image") from error
+        raise UnreadableImageError(_why_unknown(path)) from error
     except OSError as error:  # missing permission, a pipe or device, a name that is too long
         reason = error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UnreadableImageError(reason) from error
@@ -148,10 +151,30 @@ def open_image(path: Path, max_pixels: int = MAX_IMAGE_PIXELS) -> Image.Image:
     return image
 
 
+@functools.cache
+def _register_heif() -> bool:
+    """Lets Pillow read HEIC and HEIF, the format of iPhones, if pillow-heif is installed."""
+    try:
+        importlib.import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return False
+    return True
+
+
 def _formats() -> list[str]:
     """The members of `FORMATS` that this version of Pillow can read."""
     Image.init()
+    _register_heif()
     return [name for name in FORMATS if name in Image.OPEN]
+
+
+def _why_unknown(path: Path) -> str:
+    """Why no decoder recognises a file."""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(12)
+        if head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS and not _register_heif():
+            return "HEIC needs another decoder: `pip install pillow-heif`, or convert it to JPEG"
+    return "not a readable image"
 
 
 def _load(image: Image.Image) -> None:

@@ -101,7 +101,7 @@ def _report_unused(photos: ScenePhotos) -> None:
         if used and (names := photos.unused(folder)):
             warnings.warn(
                 f"{photos.root / folder}: {len(names)} files match no photo by name and are not used: "
-                f"{describe_names(names)}; the file of a.jpg is {'a.jpg.png or ' * (folder == 'masks')}a.png",
+                f"{describe_names(names)}; that of a.jpg is a.jpg.png, or a.png if no other photo has its stem",
                 WildGSWarning,
                 stacklevel=3,
             )

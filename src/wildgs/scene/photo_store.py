@@ -45,8 +45,8 @@ def with_ending(name: str, ending: str) -> str:
 def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
     """Paths of the disparity maps of a scene's photos.
 
-    `depth/<stem>.png`, including sub-folders; `depth/<name>.png` for photos whose names differ only in the
-    extension.
+    `depth/<stem>.png`, including sub-folders; `depth/<name>.png` where there is one, and for photos whose names
+    differ only in the extension.
 
     Args:
         root: The scene folder.
@@ -54,11 +54,16 @@ def depth_files(root: Path, names: Iterable[str]) -> dict[str, Path]:
     """
     names = list(names)
     shared = _shared_stems(names)
-    files = {
-        name: f"{name}.png" if with_ending(name, "") in shared else with_ending(name, ".png")
-        for name in names
-    }
-    return {name: root / "depth" / file for name, file in files.items()}
+    files = {}
+    for name in names:
+        short, full = (root / "depth" / file for file in (with_ending(name, ".png"), f"{name}.png"))
+        own = with_ending(name, "") in shared or (_has_depth(full) and not _has_depth(short))
+        files[name] = full if own else short
+    return files
+
+
+def _has_depth(disparity: Path) -> bool:
+    return is_there(disparity) or is_there(metric_file(disparity))
 
 
 def metric_file(disparity: Path) -> Path:
@@ -239,10 +244,17 @@ class ScenePhotos(PhotoStore):
         if not files:
             return []
         names = {path.relative_to(self.images_dir).as_posix() for path in self.images_dir.rglob("*")}
-        known = {path.relative_to(self.root / "depth").as_posix() for path in self._depth.values()}
-        for name in names | set(self._depth):
-            known |= {name, *(f"{name}{end}" for end in (".png", ".tiff"))}
-            known |= {with_ending(name, end) for end in (".png", ".tiff")}
+        known = set()
+        if folder == "depth":
+            others = depth_files(self.root, names - set(self._depth))
+            for path in (*self._depth.values(), *others.values()):
+                known |= {
+                    each.relative_to(self.root / "depth").as_posix() for each in (path, metric_file(path))
+                }
+        else:
+            for name in names | set(self._depth):
+                known |= {name, f"{name}.png"}
+                known |= set() if with_ending(name, "") in self._shared else {with_ending(name, ".png")}
         return sorted(
             name
             for path in files

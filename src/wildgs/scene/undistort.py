@@ -52,7 +52,8 @@ class PixelGrid:
         resized = (max(1, round(size[0] / downscale)), max(1, round(size[1] / downscale)))
         scaled = pycolmap.Camera(camera.todict())
         scaled.rescale(*resized)
-        if camera.is_undistorted():
+        # pycolmap calls a fisheye without coefficients undistorted, too.
+        if camera.is_undistorted() and "FISHEYE" not in camera.model_name:
             return cls(size, resized, _intrinsics(scaled), *resized)
         pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), scaled)
         excess = max(pinhole.width, pinhole.height) / (max_side or np.inf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import unicodedata
 import warnings
@@ -61,7 +62,7 @@ class WorkingCopy:
 def list_photos(folder: Path) -> list[str]:
     """Photos in a folder and its sub-folders, as sorted relative paths; hidden files are skipped.
 
-    Warns of files that are not photos.
+    Links to folders are followed, once each. Warns of files that are not photos.
 
     Raises:
         UserError: The folder does not exist or contains no photos.
@@ -69,10 +70,8 @@ def list_photos(folder: Path) -> list[str]:
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; give the folder of the photos")
     names, others, broken = [], [], []
-    for path in sorted(folder.rglob("*")):
+    for path in _files_below(folder):
         name = path.relative_to(folder).as_posix()
-        if any(part.startswith(".") for part in PurePosixPath(name).parts) or path.is_dir():
-            continue
         if path.is_symlink() and not path.exists():
             broken.append(name)
         else:
@@ -94,6 +93,20 @@ def list_photos(folder: Path) -> list[str]:
             stacklevel=2,
         )
     return names
+
+
+def _files_below(folder: Path) -> list[Path]:
+    """Files in a folder and its sub-folders, sorted, without hidden ones."""
+    files, visited = [], set()
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        visited.add(os.path.realpath(parent))
+        folders[:] = [
+            name
+            for name in sorted(folders)
+            if not name.startswith(".") and os.path.realpath(Path(parent, name)) not in visited
+        ]
+        files += [Path(parent, name) for name in names if not name.startswith(".")]
+    return sorted(files)
 
 
 def _is_photo(path: Path) -> bool:
