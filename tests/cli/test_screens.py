@@ -17,13 +17,13 @@ from wildgs.files import written_aside
 from wildgs.runs import load_run
 
 SOURCE = Path(__file__).parents[2] / "src"
-TRAIN = ("--method", "3dgs", "--steps", "30", "--checkpoint-every", "1000")
+TRAIN = ("--method", "3dgs", "--checkpoint-every", "1000")
 
 
 def start(
-    landmark: Path, run: Path, *options: object, python: str | Path = sys.executable, **streams: object
+    landmark: Path, run: Path, steps: int = 30, python: str | Path = sys.executable, **streams: object
 ) -> subprocess.Popen[bytes]:
-    command = [python, "-m", "wildgs", "train", landmark, "--output", run, *TRAIN, *options]
+    command = [python, "-m", "wildgs", "train", landmark, "--output", run, *TRAIN, "--steps", steps]
     environment = os.environ | {"PYTHONPATH": str(SOURCE), "WILDGS_NUM_THREADS": "1"}
     return subprocess.Popen([str(part) for part in command], env=environment, **streams)  # pyright: ignore
 
@@ -57,9 +57,7 @@ def test_a_reader_that_leaves(
 def test_a_closed_terminal_saves(landmark: Path, tmp_path: Path) -> None:
     run, steps = tmp_path / "run", 100_000
     ours, theirs = os.openpty()
-    process = start(
-        landmark, run, "--steps", steps, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
-    )
+    process = start(landmark, run, steps, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True)
     os.close(theirs)
     while not (run / "metrics.jsonl").is_file() or not (run / "metrics.jsonl").stat().st_size:
         assert process.poll() is None

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import inspect
-import io
 import logging
-import os
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from wildgs import processes
+from wildgs.cli import streams
+from wildgs.cli.arguments import refuse_empty, refuse_repeated
 from wildgs.errors import ReportedError, UserError, WildGSWarning
 from wildgs.version import __version__
 
@@ -50,10 +50,7 @@ logger.addHandler(
 def main(arguments: list[str] | None = None) -> None:
     """Runs a verb. Exit codes: 0 success, 2 user error (one line on stderr), 130 or 143 interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    for stream in (sys.stdout, sys.stderr):  # file names need not be valid UTF-8
-        if isinstance(stream, io.TextIOWrapper):
-            with contextlib.suppress(OSError):
-                stream.reconfigure(errors="backslashreplace")
+    streams.prepare_streams()
     try:
         _dispatch_and_flush(arguments)
     except ReportedError:
@@ -61,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         _fail(" ".join(str(error).split()))
     except BrokenPipeError:
-        if not _stdout_is_closed():
+        if not streams.stdout_is_closed():
             raise
         sys.exit(BROKEN_PIPE)
     except KeyboardInterrupt as interrupt:
@@ -69,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
             _print_error(str(interrupt) or "interrupted")
         sys.exit(getattr(interrupt, "code", INTERRUPTED))
     finally:
-        _flush_streams()
+        streams.flush_streams()
 
 
 def _dispatch_and_flush(arguments: list[str]) -> None:
@@ -78,19 +75,9 @@ def _dispatch_and_flush(arguments: list[str]) -> None:
         _dispatch(arguments)
     except SystemExit as end:
         if not end.code:
-            _flush_stdout()
+            streams.flush_stdout()
         raise
-    _flush_stdout()
-
-
-def _flush_stdout() -> None:
-    """Flushes stdout; raises only if its reader has closed it."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except (OSError, ValueError):
-        pass  # discarded by `_flush_streams`
+    streams.flush_stdout()
 
 
 def _dispatch(arguments: list[str]) -> None:
@@ -101,41 +88,35 @@ def _dispatch(arguments: list[str]) -> None:
         print(f"wildgs {__version__}")
         return
     verb, *rest = arguments
-    _refuse_empty(rest)
+    refuse_empty(rest)
     if verb not in VERBS:
         raise UserError(f"unknown command {verb!r}; `wildgs --help` lists the commands")
     if processes.world_size() > 1 and verb not in DISTRIBUTED:
         raise UserError(f"`wildgs {verb}` runs in one process; start it without torchrun")
+    _refuse_deleted_folder()
     with processes.library_environment():
         _run(verb, rest)
 
 
-def _refuse_empty(arguments: list[str]) -> None:
-    """Raises `UserError` for an empty argument, which would be read as the current folder; a title may be empty."""
-    for before, argument in zip(["", *arguments], arguments, strict=False):
-        option, equals, value = argument.partition("=")
-        if before != "--title" and (not argument or (option.startswith("--") and equals and not value)):
-            which = f" of {before}" if before.startswith("--") else f" of {option}" if equals else ""
-            raise UserError(f"the value{which} is empty; give one (an unset variable of the shell is empty)")
+def _refuse_deleted_folder() -> None:
+    """Raises `UserError` if the current folder has been deleted, where MKL would end the process."""
+    try:
+        Path.cwd()
+    except FileNotFoundError as error:
+        raise UserError("the current folder does not exist any more; change to another one") from error
 
 
 def _run(verb: str, arguments: list[str]) -> None:
-    import tyro
-
     module = importlib.import_module(f"wildgs.cli.{verb}")
-    # A preset or a run to resume among the arguments changes the defaults of the other options.
-    kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
-    description = inspect.cleandoc(module.Command.__doc__)
-    if HELP_ALL in arguments:
-        tyro.cli(kind, prog=f"wildgs {verb}", args=["--help"], description=description)
-    if any(option in arguments for option in HELP):
-        _help(verb, module, kind, description)
-    command = tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=description)
+    refuse_repeated(arguments, getattr(module, "REPEATABLE", ()))
+    with streams.readable_width():
+        command = _parse(verb, module, arguments)
     from wildgs.cli.screen import Lines
 
     if verb != "doctor":  # doctor reports missing packages itself
+        importlib.import_module("wildgs.scene")  # before pycolmap, see there
         # Imports pycolmap now: it installs a SIGTERM handler, which would replace ours if it came later.
-        importlib.import_module("wildgs.scene")
+        importlib.import_module("pycolmap")
     lines, level = Lines(), logger.level
     logger.addHandler(lines)
     logger.setLevel(min(logging.INFO, level or logging.INFO))
@@ -149,6 +130,20 @@ def _run(verb: str, arguments: list[str]) -> None:
         warnings.showwarning = showwarning
         logger.removeHandler(lines)
         logger.setLevel(level)
+
+
+def _parse(verb: str, module: ModuleType, arguments: list[str]) -> Any:
+    """Reads the options of a command; for help, prints it and exits."""
+    import tyro
+
+    # A preset or a run to resume among the arguments changes the defaults of the other options.
+    kind = module.command_for(arguments) if hasattr(module, "command_for") else module.Command
+    description = inspect.cleandoc(module.Command.__doc__)
+    if HELP_ALL in arguments:
+        tyro.cli(kind, prog=f"wildgs {verb}", args=["--help"], description=description)
+    if any(option in arguments for option in HELP):
+        _help(verb, module, kind, description)
+    return tyro.cli(kind, prog=f"wildgs {verb}", args=arguments, description=description)
 
 
 def _help(verb: str, module: ModuleType, kind: type, description: str) -> None:
@@ -167,31 +162,6 @@ def _help(verb: str, module: ModuleType, kind: type, description: str) -> None:
                 f"`wildgs {verb} {HELP_ALL}` shows all {count_options(kind)} options; a run's config.yaml holds "
                 "their values."
             )
-
-
-def _stdout_is_closed() -> bool:
-    """Whether the reader of stdout has closed it; if so, further output is discarded."""
-    try:
-        print(flush=True)
-    except BrokenPipeError:
-        discard_output(sys.stdout)
-        return True
-    return False
-
-
-def _flush_streams() -> None:
-    """Flushes both streams; if that fails, discards the output so that Python's own flush at exit succeeds."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except (OSError, ValueError):
-            discard_output(stream)
-
-
-def discard_output(stream: Any) -> None:
-    """Discards what is left in a stream's buffer, and all further output to it."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _warning_printer() -> Callable[..., None]:

@@ -12,7 +12,7 @@ import tyro
 
 from wildgs import processes
 from wildgs.cli.options import UNNAMED
-from wildgs.cli.screen import OUT, console, progress_shown
+from wildgs.cli.screen import OUT, console, print_table, progress_shown
 from wildgs.config import ExecutionConfig, RunConfig
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import ReportedError, UserError
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 RANK_0_REPORTS = 10.0
 """Seconds that other ranks wait before they exit with an error that rank 0 reports."""
-WIDTH_IN_FILES = 240
-"""Width of the printed table in characters when stdout is not a terminal."""
+REPEATABLE = ("--variant",)
+"""Options whose values add up if they are given several times."""
 SHOWN = (
     "output",
     "suite",
@@ -137,4 +137,4 @@ def _print_table(rows: Sequence[Row]) -> None:
         table = Table(*section.header, title=section.title, title_justify="left")
         for line in section.lines:
             table.add_row(*line)
-        console.print(table, width=None if console.is_terminal else WIDTH_IN_FILES)
+        print_table(table)

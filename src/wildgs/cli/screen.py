@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -19,10 +20,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segments
 from rich.table import Table
 
 from wildgs import processes
-from wildgs.cli import discard_output
+from wildgs.cli.streams import discard_output
 
 if TYPE_CHECKING:
     from wildgs.engine.report import StepReport
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
 
 LINE_SECONDS = 10.0
 REFRESH_STEPS = 10
+NAME_WIDTH = 8
+"""Least width of a table's column of names in characters."""
+UNLIMITED = 10_000
+"""More characters than any table is wide."""
 _SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips", 3))
 _PARTS = (
     ("PSNR landmark", "landmark", 2),
@@ -220,10 +226,31 @@ def print_scores(runs: Mapping[str, Scores]) -> None:
             cells += [_percent(metrics.get(key)) for key in ("static_hidden", "static_hidden_worst")]
             parts.add_row(name, protocol, *cells)
             notes |= dict.fromkeys(metrics.get("notes", ()))
-    console.print(table)
-    console.print(parts)
+    print_table(table)
+    print_table(parts)
     for note in notes:
         console.print(note, style="dim")
+
+
+def print_table(table: Table) -> None:
+    """Prints a table, of which nothing is cut: on a narrow terminal, text continues on the next line."""
+    options = console.options.update(width=UNLIMITED)
+    if console.is_terminal and console.measure(table, options=options).maximum > console.width:
+        _squeeze(table, console.width)
+    # As segments, because `print` would limit the width to the terminal's.
+    console.print(Segments(console.render(table, options)))
+
+
+def _squeeze(table: Table, width: int) -> None:
+    """Makes columns as narrow as their longest word; the first, of names, gets what is left and breaks anywhere."""
+    first, *others = table.columns
+    table.padding = (0, 0)
+    for column in others:
+        words = " ".join(map(str, (column.header, *column.cells))).split()
+        column.width = max(map(cell_len, words), default=1)
+    left = width - sum((column.width or 0) + 1 for column in others) - 2
+    longest = max(cell_len(str(cell)) for cell in (first.header, *first.cells))
+    first.width, first.overflow = max(min(left, longest), NAME_WIDTH), "fold"
 
 
 def _number(value: float | None, digits: int) -> str:
