@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import subprocess
 import sys
@@ -112,6 +113,18 @@ def test_paths_are_of_the_photos_usual_size_unless_told(scene) -> None:
 def test_a_look_given_is_given_back(scene) -> None:
     look = scene.appearance(scene.views[0].name)
     assert scene.appearance(look) is look
+
+
+def test_names_are_not_looks(scene) -> None:
+    # Without the shape checks of these tests, which refuse other types themselves.
+    name, look = scene.views[0].name, scene.appearance("neutral")
+    render, mix = (inspect.unwrap(function) for function in (wildgs.LoadedScene.render, wildgs.mix))
+    with pytest.raises(UserError, match=rf"'{name}' is not an appearance; .* scene\.appearance\(name\)"):
+        render(scene, scene.views[0].camera, name)
+    with pytest.raises(UserError, match="'neutral' is not an appearance"):
+        mix([look, "neutral"], [0.5, 0.5])
+    with pytest.raises(UserError, match="an appearance without a name"):
+        scene.appearance("")
 
 
 def test_plain_3dgs_has_its_own_light(landmark: Path, tmp_path: Path) -> None:

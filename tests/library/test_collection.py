@@ -58,6 +58,15 @@ def test_every_difference_is_named(photos: Path, scene: Path) -> None:
         wildgs.run(photos, scene.parent)
 
 
+def test_the_folder_of_the_photos_is_not_to_be_deleted(photos: Path, scene: Path) -> None:
+    Image.new("RGB", (8, 8), "red").save(photos / "new.jpg")
+    with pytest.raises(UserError, match=f"or delete {scene.parent} to start again"):
+        wildgs.run(photos, scene.parent)
+    inside = photos.rename(scene / "images")
+    with pytest.raises(UserError, match=r"choose another --output$"):
+        wildgs.run(inside, scene.parent)
+
+
 def test_a_scene_without_a_record_is_compared_by_names(photos: Path, tmp_path: Path) -> None:
     scene = tmp_path / "old"
     (scene / "images").mkdir(parents=True)

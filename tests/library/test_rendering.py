@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,79 @@ def test_unknown_protocols_are_refused(protocols, trained: Path) -> None:
 
 def test_a_protocol_may_be_a_plain_name(trained: Path) -> None:
     assert list(wildgs.evaluate(trained, "half")) == ["half"]
+
+
+def _camera_file(scene: wildgs.LoadedScene, folder: Path, *sizes: tuple[int, int]) -> str:
+    file = folder / "cameras.json"
+    cameras = [scene.views[0].camera.resized(*size) for size in sizes]
+    write_camera_path(file, cameras, fps=10.0)
+    return str(file)
+
+
+def test_the_cameras_of_a_file_may_show_a_day(trained: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    scene = wildgs.load(run)
+    path = wildgs.TrajectoryOptions(path=_camera_file(scene, tmp_path, (24, 16), (24, 16)))
+    assert wildgs.render(scene, tmp_path / "frames", over="day", trajectory=path).pictures == 2
+
+
+def test_only_a_video_needs_one_size(trained: Path, tmp_path: Path) -> None:
+    scene = wildgs.load(trained)
+    path = wildgs.TrajectoryOptions(path=_camera_file(scene, tmp_path, (24, 16), (20, 10)))
+    assert wildgs.render(scene, tmp_path / "frames", trajectory=path).size == (20, 10)
+    for number, size in enumerate([(24, 16), (20, 10)]):
+        with Image.open(tmp_path / "frames" / f"frame_{number:05d}.png") as picture:
+            assert picture.size == size
+    with pytest.raises(UserError, match="same image size; give a folder"):
+        wildgs.render(scene, tmp_path / "a.mp4", trajectory=path)
+
+
+@pytest.mark.parametrize("path", ["orbit", "training", "spiral", "file", None])
+def test_views_that_a_path_does_not_use_are_refused(path: str | None, trained: Path, tmp_path: Path) -> None:
+    scene = wildgs.load(trained)
+    file = _camera_file(scene, tmp_path, (24, 16)) if path == "file" else path
+    output = tmp_path / ("frames" if path else "a.mp4")
+    with pytest.raises(UserError, match="--view is not used on the path"):
+        wildgs.render(scene, output, views=["x.jpg"], trajectory=wildgs.TrajectoryOptions(path=file))
+
+
+@pytest.mark.parametrize("option", ["seconds", "fps"])
+def test_options_of_a_video_are_refused_for_views(option: str, trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=f"--{option} is only used for a video: add --path"):
+        wildgs.render(trained, tmp_path / "out", trajectory=wildgs.TrajectoryOptions(**{option: 2.0}))
+
+
+def test_views_and_appearances_given_twice_are_rendered_once(trained: Path, tmp_path: Path) -> None:
+    scene = wildgs.load(trained)
+    name = scene.views[0].name
+    done = wildgs.render(
+        scene, tmp_path / "out", views=[name, Path(name).stem], appearance=["neutral", "neutral"]
+    )
+    assert done.pictures == len(list((tmp_path / "out").rglob("*.png"))) == 1
+
+
+def test_names_of_other_files_are_no_folders(trained: Path, tmp_path: Path) -> None:
+    for name in ("c21.tiff", "a.PLY", "b.webp"):
+        with pytest.raises(UserError, match=r"unsupported file type; use \.png or \.jpg"):
+            wildgs.render(trained, tmp_path / name)
+    (tmp_path / "old.png").mkdir()
+    assert wildgs.render(trained, tmp_path / "old.png").output.is_dir()
+    assert len(list((tmp_path / "old.png").rglob("*.png"))) == 2
+    (tmp_path / "file").write_text("")
+    for output in ("file", "file/a.png"):
+        with pytest.raises(UserError, match="is a file; give a folder"):
+            wildgs.render(trained, tmp_path / output)
+
+
+def test_a_loaded_run_stays_where_it_is(trained: Path, tmp_path: Path, monkeypatch) -> None:
+    shutil.copytree(trained, tmp_path / "here" / "run")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    scene = wildgs.load("run")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    (ply,) = wildgs.export(scene, "ply")
+    assert ply.file == tmp_path / "here" / "run" / "export" / "neutral.ply"
+    written = wildgs.gallery(scene, views=[scene.views[0].name], appearance="neutral")
+    assert written.sheet.is_relative_to(tmp_path / "here")
+    wildgs.evaluate(scene, "half")
+    assert list((tmp_path / "elsewhere").iterdir()) == []

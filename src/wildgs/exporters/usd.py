@@ -35,7 +35,7 @@ def write_usd(file: Path, scene: RelightableScene) -> None:
     """
     pxr = _modules()
     with written_aside(file) as aside:
-        named = aside.with_name(aside.name + file.suffix)  # USD chooses the format by the extension
+        named = aside.with_name(aside.name + ".usd")  # USD chooses the format by the extension
         try:
             stage = pxr.Usd.Stage.CreateNew(str(named))
             _author(pxr, stage, scene)

@@ -13,14 +13,13 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from wildgs.errors import UserError
+from wildgs.exporters.outputs import file_suffix, require_folder
 from wildgs.files import written_aside
 
 MUXERS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 """Container formats of ffmpeg by file extension."""
 
 SUFFIXES = tuple(MUXERS)
-OTHER_MEDIA = (".gif", ".avi", ".webm", ".mpg", ".mpeg", ".wmv", ".png", ".jpg", ".jpeg", ".webp", ".apng")
-"""Extensions of unsupported formats, which are not accepted as folder names."""
 
 ENCODING: dict[str, Any] = {
     "codec": "libx264",
@@ -43,17 +42,21 @@ def check_output(path: Path) -> None:
     """Checks an output path before rendering starts.
 
     Raises:
-        UserError: The video format is not supported, or imageio-ffmpeg is not installed.
+        UserError: The video format is not supported, imageio-ffmpeg is not installed, or there is a file where a
+            folder is needed.
     """
-    if path.suffix.lower() in OTHER_MEDIA:
+    if is_video(path):
+        if path.is_dir():
+            raise UserError(f"{path} is a folder; give another name for the video file")
+        require_folder(path.parent)
+        _ffmpeg()
+        return
+    if file_suffix(path) is not None:
         supported = ", ".join(SUFFIXES)
         raise UserError(
             f"{path}: unsupported file type; use {supported}, or a name without extension for a folder of PNGs"
         )
-    if is_video(path):
-        if path.is_dir():
-            raise UserError(f"{path} is a folder; give another name for the video file")
-        _ffmpeg()
+    require_folder(path)
 
 
 def _ffmpeg() -> Any:
@@ -114,8 +117,6 @@ def _count_frames(video: Path) -> int:
 
 
 def _write_folder(path: Path, frames: Frames) -> None:
-    if path.exists() and not path.is_dir():
-        raise UserError(f"{path} is a file; give a folder for the frames")
     with tempfile.TemporaryDirectory(
         dir=path.parent, prefix=f".{path.name}.part.", ignore_cleanup_errors=True
     ) as folder:

@@ -15,12 +15,13 @@ from wildgs.exporters.config import CleanupConfig
 from wildgs.exporters.formats import SplatFormat, SpzVersion, write_splats
 from wildgs.exporters.glb import glb_bytes
 from wildgs.exporters.lights import ExportLight, RelightableScene, SharedHarmonics, share_harmonics, upright
+from wildgs.exporters.outputs import names_file
 from wildgs.exporters.splats import Splats, agreement, clean
 from wildgs.exporters.usd import write_usd
 from wildgs.files import written_aside
 from wildgs.library.config import ExportFormat, MixOptions
 from wildgs.library.day import read_times, viewpoints_of
-from wildgs.library.loaded import LoadedScene, find_looks, loaded
+from wildgs.library.loaded import LoadedScene, Spec, find_looks, folder_of, loaded, without_repeats
 from wildgs.library.logs import logger
 from wildgs.library.pages import ExportedFile, baked, page_looks, thumbnail, write_webpage
 from wildgs.light.look import NEUTRAL, Look
@@ -38,6 +39,7 @@ class _Request:
 
     scene: LoadedScene
     output: Path
+    single: bool  # whether the output is the only file, rather than a folder
     title: str
     aligned: bool
     cleanup: CleanupConfig
@@ -46,7 +48,7 @@ class _Request:
 
 def export(
     run: str | Path | LoadedScene,
-    formats: ExportFormat | Sequence[ExportFormat] = "html",
+    formats: str | Sequence[str] = "html",
     *,
     appearance: str | Path | Look | Sequence[str | Path | Look] = (),
     output: str | Path | None = None,
@@ -74,25 +76,27 @@ def export(
         progress: Called during long work.
 
     Raises:
-        UserError: An appearance cannot be obtained, no Gaussian is left, or a file cannot be written.
+        UserError: A format is unknown, an appearance cannot be obtained, no Gaussian is left, or a file cannot be
+            written.
     """
-    formats = [formats] if isinstance(formats, str) else list(formats)
+    formats = _known_formats([formats] if isinstance(formats, str) else formats)
     kinds: list[SplatFormat] = [kind for kind in formats if kind not in ("html", "glb", "usd")]
-    if not formats:
-        raise UserError(f"--format needs at least one of {', '.join(get_args(ExportFormat))}")
     scene = loaded(run)
-    folder = scene.run.folder
+    output = folder_of(run) / "export" if output is None else Path(output)
+    appearance = without_repeats(scene, appearance, mixing)
+    count = _count_files(formats, appearance, mixing or MixOptions())
     request = _Request(
         scene,
-        folder / "export" if output is None else Path(output),
-        title or folder.resolve().name,
+        output,
+        names_file(output, tuple(f".{kind}" for kind in formats), count),
+        title or scene.run.folder.resolve().name,
         aligned,
         cleanup or CleanupConfig(),
         spz_version,
     )
     chosen = bool(appearance) or (mixing or MixOptions()) != MixOptions()
     looks = find_looks(scene, appearance or (NEUTRAL,), mixing, progress=progress) if kinds or chosen else []
-    files = _files(request, looks, kinds, alone=len(kinds) == len(formats))
+    files = _files(request, looks, kinds)
     if scene.gaussians.antialiased and any(kind != "html" for kind in formats):
         logger.info(
             "the run is antialiased, which these formats cannot record: programs that render without antialiasing"
@@ -102,7 +106,8 @@ def export(
     shown = looks if chosen or not several else page_looks(scene, progress)
     written = []
     for kind in several:
-        file = _file_of_all(request, f"page.{kind}" if kind == "html" else f"scene.{kind}", len(formats) == 1)
+        name = f"page.{kind}" if kind == "html" else f"scene.{kind}"
+        file = request.output if request.single else request.output / name
         write = _write_page if kind == "html" else _write_relightable
         written.append(write(request, shown, file))
     for look in looks if kinds else ():
@@ -110,12 +115,30 @@ def export(
     return written
 
 
+def _known_formats(formats: Sequence[str]) -> list[ExportFormat]:
+    """The formats in their order, each once; raises `UserError` if one is unknown or there is none."""
+    known: tuple[ExportFormat, ...] = get_args(ExportFormat)
+    if not formats:
+        raise UserError(f"--format needs at least one of {', '.join(known)}")
+    for name in formats:
+        if name not in known:
+            raise UserError(f"unknown format {name!r}; choose {', '.join(known)}")
+    return [kind for kind in dict.fromkeys(formats) if kind in known]
+
+
+def _count_files(formats: Sequence[ExportFormat], specs: Sequence[Spec], mixing: MixOptions) -> int:
+    """Number of files, before any appearance is computed."""
+    several = sum(kind in ("html", "glb", "usd") for kind in formats)
+    looks = 1 if mixing.weights else max(len(specs), 1)
+    return several + (len(formats) - several) * looks
+
+
 def _files(
-    request: _Request, looks: list[Look], kinds: list[SplatFormat], *, alone: bool
+    request: _Request, looks: list[Look], kinds: list[SplatFormat]
 ) -> dict[tuple[Look, SplatFormat], Path]:
     """The file of each look in each format; all names are unique."""
     folder = request.output
-    if len(looks) * len(kinds) == 1 and alone and folder.name.endswith(f".{kinds[0]}"):
+    if request.single and kinds:
         return {(looks[0], kinds[0]): folder}
     named = picture_paths([f"{number}/{look.name}" for number, look in enumerate(looks)])
     stems = [path.relative_to(path.parts[0]).with_suffix("") for path in named.values()]
@@ -125,12 +148,6 @@ def _files(
         for number, (look, stem) in enumerate(zip(looks, stems, strict=True))
         for kind in kinds
     }
-
-
-def _file_of_all(request: _Request, name: str, alone: bool) -> Path:
-    """The path of a file with all lights."""
-    output = request.output
-    return output if alone and output.suffix == Path(name).suffix else output / name
 
 
 def _write_page(request: _Request, looks: Sequence[Look], file: Path) -> ExportedFile:
@@ -152,7 +169,7 @@ def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> 
         splats[0],
         [each.sh for each in splats],
         motion.apply_points(viewpoints),
-        request.cleanup.own_harmonics if file.suffix == ".glb" else 1.0,
+        request.cleanup.own_harmonics if file.suffix.lower() == ".glb" else 1.0,
     )
     content = RelightableScene(
         title=request.title,
@@ -165,7 +182,7 @@ def _write_relightable(request: _Request, looks: Sequence[Look], file: Path) -> 
         near=NEAR * motion.scale,
         placement=_to_colmap(motion, loaded.run.alignment),
     )
-    if file.suffix == ".usd":
+    if file.suffix.lower() == ".usd":
         write_usd(file, content)
     else:
         with written_aside(file) as aside:

@@ -11,15 +11,17 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from wildgs.errors import UserError
-from wildgs.files import written_aside
+from wildgs.exporters.outputs import names_file
+from wildgs.files import is_file, written_aside
 from wildgs.library.config import MixOptions
-from wildgs.library.loaded import LoadedScene, find_looks, loaded
+from wildgs.library.loaded import LoadedScene, Spec, find_looks, folder_of, loaded, without_repeats
 from wildgs.library.pages import different_lights
-from wildgs.library.rendering import render_each
+from wildgs.library.rendering import find_views, render_each
 from wildgs.light.look import NEUTRAL, Look
+from wildgs.light.saved import SUFFIX
 from wildgs.light.sources import read_picture
 from wildgs.progress import Progress
-from wildgs.scene import Scene, find_view, match_view
+from wildgs.scene import Scene, match_view
 
 VIEWS, LIGHTS = 4, 5
 TILE = 320
@@ -52,7 +54,7 @@ def gallery(
     output: str | Path | None = None,
     *,
     views: Sequence[str] = (),
-    appearance: str | Sequence[str] = (),
+    appearance: Spec | Sequence[Spec] = (),
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> WrittenGallery:
@@ -71,13 +73,13 @@ def gallery(
     """
     scene = loaded(run)
     held_out = scene.scene.test_views or scene.scene.train_views
-    rows = [find_view(scene.scene, name) for name in views] or held_out[:: max(1, -(-len(held_out) // VIEWS))]
+    output = folder_of(run) / "gallery" if output is None else Path(output)
+    single = names_file(output, tuple(FORMATS))
+    rows = find_views(scene.scene, views) or held_out[:: max(1, -(-len(held_out) // VIEWS))]
     if not rows:
         raise UserError(f"{scene.scene.root} has no photo with a camera")
-    specs = ([appearance] if isinstance(appearance, str) else appearance) or _default_lights(scene)
+    specs = without_repeats(scene, appearance, mixing) or _default_lights(scene)
     looks = find_looks(scene, specs, mixing, progress=progress)
-    output = scene.run.folder / "gallery" if output is None else Path(output)
-    single = output.suffix.lower() in FORMATS
     sheet, folder = (output, None) if single else (output / "gallery.jpg", output)
     tiles = [picture.numpy() for picture in render_each(scene, rows, looks, folder, progress=progress)]
     grid: list[list[Picture | None]] = [
@@ -104,13 +106,16 @@ def _default_lights(scene: LoadedScene) -> list[str]:
     return [NEUTRAL, *(view.name for view in different_lights(scene.scene.train_views, LIGHTS))]
 
 
-def _source(scene: Scene, spec: str) -> np.ndarray | None:
+def _source(scene: Scene, spec: Spec) -> np.ndarray | None:
     """The image of which an appearance is the embedding, if there is one."""
+    spec = spec.name if isinstance(spec, Look) else str(spec)
+    if spec == NEUTRAL or spec.endswith(SUFFIX):
+        return None
     view = match_view(scene.views, spec)
     if view is not None:
         return view.read_photo().numpy()
     file = Path(spec)
-    if spec == NEUTRAL or file.suffix == ".safetensors" or not file.is_file():
+    if not is_file(file):
         return None
     return read_picture(file).numpy()
 

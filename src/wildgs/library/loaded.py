@@ -20,17 +20,20 @@ from wildgs.evaluation.metrics import to_8bit
 from wildgs.evaluation.photos import PhotoFit, find_misfits, inspect_photos, read_photos, write_photos
 from wildgs.geometry.camera import Camera
 from wildgs.library.config import MixOptions
-from wildgs.light.look import NEUTRAL, Look, Timeline, mix, with_sky
+from wildgs.light.look import NEUTRAL, Look, Timeline, mix, require_look, with_sky
 from wildgs.light.photos import KeptAppearances
-from wildgs.light.saved import save_look
+from wildgs.light.saved import SUFFIX, save_look
 from wildgs.light.sources import LightSources
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
 from wildgs.progress import Progress, counter
 from wildgs.rasterize import blend
 from wildgs.runs import Run, load_run
-from wildgs.scene import Scene, View
+from wildgs.scene import Scene, View, match_view
 from wildgs.scene.trajectories import make_path
+
+Spec = str | Path | Look
+"""What `LoadedScene.appearance` accepts."""
 
 FEATURE_INDEX_FILE = "feature_index.safetensors"
 """Feature index in the run folder, created when the first new photo is localised."""
@@ -109,8 +112,9 @@ class LoadedScene:
                 with the response of the photo's camera if the run fits one.
 
         Raises:
-            UserError: The look belongs to another run.
+            UserError: The look belongs to another run, or is the name of one.
         """
+        require_look(look)
         method = self.run.method
         if look.method is not method:
             raise UserError(f"the appearance {look.name!r} belongs to another run; obtain it from this one")
@@ -194,7 +198,8 @@ def load(run: str | Path, device: torch.device | str | None = None) -> LoadedSce
     Raises:
         UserError: The folder is not a run folder, or has no checkpoint yet.
     """
-    return LoadedScene(load_run(Path(run), None if device is None else torch.device(device)))
+    # Absolute, so that the scene does not follow the working directory of the process.
+    return LoadedScene(load_run(Path(run).absolute(), None if device is None else torch.device(device)))
 
 
 @dataclass(frozen=True)
@@ -243,6 +248,34 @@ def appearance(
 def loaded(run: str | Path | LoadedScene) -> LoadedScene:
     """The scene itself, or that loaded from a run folder."""
     return run if isinstance(run, LoadedScene) else load(run)
+
+
+def folder_of(run: str | Path | LoadedScene) -> Path:
+    """The run folder, as given."""
+    return run.run.folder if isinstance(run, LoadedScene) else Path(run)
+
+
+def without_repeats(
+    scene: LoadedScene, specs: Spec | Sequence[Spec], mixing: MixOptions | None = None
+) -> list[Spec]:
+    """Specs of appearances in their order, each once, unless they have weights."""
+    specs = [specs] if isinstance(specs, str | Path | Look) else list(specs)
+    if mixing and mixing.weights:
+        return specs
+    once: dict[str | Look, Spec] = {}
+    for spec in specs if scene.relightable else specs[:1]:
+        once.setdefault(_key(scene, spec), spec)
+    return list(once.values())
+
+
+def _key(scene: LoadedScene, spec: Spec) -> str | Look:
+    """What specs of the same appearance have in common: photos may be named with or without extension."""
+    if isinstance(spec, Look):
+        return spec
+    if spec == NEUTRAL or str(spec).endswith(SUFFIX):
+        return str(spec)
+    view = match_view(scene.views, str(spec))
+    return str(spec) if view is None else view.name
 
 
 def find_looks(

@@ -32,7 +32,7 @@ from wildgs.light.photos import encode_view
 from wildgs.model.gaussians import NEAR
 from wildgs.model.method import Method
 from wildgs.progress import Progress
-from wildgs.scene import Scene, View, match_view
+from wildgs.scene import Scene, View
 from wildgs.scene.images import UnreadableImageError, read_photo
 from wildgs.scene.start import choose_start
 from wildgs.sfm.report import describe_placed, read_left_out
@@ -128,7 +128,7 @@ def baked(loaded: LoadedScene, look: Look) -> Splats:
 
 def thumbnail(loaded: LoadedScene, look: Look, start: View) -> np.ndarray:
     """The photo of a look; if it is not a photo of the scene, a render of the start view under it."""
-    view = match_view(loaded.views, look.name)
+    view = next((view for view in loaded.views if view.name == look.name), None)
     pixels = loaded.render(start.camera, look) if view is None else view.read_photo()
     return pixels.numpy()
 

@@ -138,9 +138,10 @@ def _estimate_poses(photos: Path, scene: Path, sfm: SfmConfig | None, progress: 
         return
     changes = compare_collection(photos, scene)
     if changes:
+        inside = photos.resolve().is_relative_to(scene.parent.resolve())
+        again = "" if inside else f", or delete {scene.parent} to start again with these photos"
         raise UserError(
-            f"{photos} has changed since {scene} was made: {changes}; choose another --output, or delete "
-            f"{scene.parent} to start again with these photos"
+            f"{photos} has changed since {scene} was made: {changes}; choose another --output{again}"
         )
     if options := changed_options(scene, sfm or SfmConfig()):
         raise UserError(

@@ -14,16 +14,17 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths, write_picture
+from wildgs.exporters.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, file_suffix, require_folder
 from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
 from wildgs.geometry.trajectory import still
 from wildgs.library.config import MixOptions, TrajectoryOptions
 from wildgs.library.day import day_timeline, find_day
-from wildgs.library.loaded import LoadedScene, find_looks, loaded
+from wildgs.library.loaded import LoadedScene, Spec, find_looks, loaded, without_repeats
 from wildgs.light.day import Day
 from wildgs.light.look import NEUTRAL, Look, Timeline
 from wildgs.progress import Progress, counter
-from wildgs.scene import View, find_view
+from wildgs.scene import Scene, View, find_view
 from wildgs.scene.start import choose_start
 from wildgs.scene.trajectories import AROUND, THROUGH, read_path
 
@@ -33,9 +34,6 @@ DEFAULT_SECONDS, DAY_SECONDS = 5.0, 10.0
 MAX_FRAMES = 100_000
 MAX_FPS = 1000
 MAX_SIDE, MAX_PIXELS = 16_384, 2**27
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
-
-Spec = str | Path | Look
 
 
 @dataclass(frozen=True)
@@ -99,22 +97,27 @@ def render(
     if over is not None:
         return _render_day(loaded(run), output, photos, views, trajectory, progress)
     if trajectory.path is None and not is_video(output):
-        if to:
-            raise UserError(
-                "--to changes the light during a video: add --path, or give a video file as --output"
-            )
+        _refuse_video_options(trajectory, to)
         return _render_views(loaded(run), output, appearance, views, trajectory.size, mixing, progress)
     check_output(output)
     scene = loaded(run)
-    cameras, fps = _find_cameras(scene, trajectory, views)
+    cameras, fps = _find_cameras(scene, trajectory, views, one_size=is_video(output))
     looks = find_looks(scene, appearance, mixing, progress=progress)
     like = MixOptions(like=mixing.like, sky=mixing.sky) if mixing else None
     looks += find_looks(scene, to, like, progress=progress)
-    if is_video(output):
-        cameras = [_even(camera) for camera in cameras]
-    size = (cameras[0].width, cameras[0].height)
-    write_frames(output, _frames(scene, cameras, looks, progress), size, fps)
+    size = _write_path(output, scene, cameras, looks, fps, progress)
     return Rendered(output, len(cameras), size, fps, tuple(looks))
+
+
+def _refuse_video_options(trajectory: TrajectoryOptions, to: Spec | Sequence[Spec]) -> None:
+    """Raises `UserError` if options of a video are given for images."""
+    if to:
+        raise UserError("--to changes the light during a video: add --path, or give a video file as --output")
+    for option, value in (("--seconds", trajectory.seconds), ("--fps", trajectory.fps)):
+        if value is not None:
+            raise UserError(
+                f"{option} is only used for a video: add --path, or give a video file as --output"
+            )
 
 
 def _render_day(
@@ -129,15 +132,13 @@ def _render_day(
     check_output(output)
     if trajectory.path == "still" and not views:
         views = [choose_start(scene.scene)[0].name]
-    seconds = DAY_SECONDS if trajectory.seconds is None else trajectory.seconds
-    cameras, fps = _find_cameras(scene, replace(trajectory, seconds=seconds), views)
+    if trajectory.seconds is None and not _is_camera_file(trajectory.path):
+        trajectory = replace(trajectory, seconds=DAY_SECONDS)
+    cameras, fps = _find_cameras(scene, trajectory, views, one_size=is_video(output))
     day = find_day(scene, None if photos is None else Path(photos), progress=progress)
     still_camera = cameras[0] if trajectory.path == "still" else None
     timeline = day_timeline(scene, day, still_camera, progress=progress)
-    if is_video(output):
-        cameras = [_even(camera) for camera in cameras]
-    size = (cameras[0].width, cameras[0].height)
-    write_frames(output, _frames(scene, cameras, timeline, progress), size, fps)
+    size = _write_path(output, scene, cameras, timeline, fps, progress)
     return Rendered(output, len(cameras), size, fps, timeline.looks, day)
 
 
@@ -160,13 +161,17 @@ def _render_views(
     progress: Progress | None,
 ) -> Rendered:
     """Renders every view under every appearance."""
-    single = output.suffix.lower() in PICTURE_SUFFIXES
-    if not single:
-        check_output(output)
-        if output.is_file():
-            raise UserError(f"{output} is a file; give a folder for the images")
+    suffix = file_suffix(output)
+    single = suffix in PICTURE_SUFFIXES
+    if suffix is not None and not single:
+        raise UserError(
+            f"{output}: unsupported file type; use .png or .jpg for an image, {', '.join(VIDEO_SUFFIXES)} for a "
+            "video, or a folder"
+        )
+    require_folder(output.parent if single else output)
     collection = scene.scene
-    views = [find_view(collection, name) for name in names] or collection.test_views or collection.train_views
+    appearance = without_repeats(scene, appearance, mixing)
+    views = find_views(collection, names) or collection.test_views or collection.train_views
     if not views:
         raise UserError(f"{collection.root} has no photo with a camera")
     looks = find_looks(scene, appearance, mixing, progress=progress)
@@ -182,6 +187,16 @@ def _render_views(
         if single:
             write_picture(output, picture)
     return Rendered(output, len(views) * len(looks), shape, None, tuple(looks))
+
+
+def find_views(scene: Scene, names: Sequence[str]) -> list[View]:
+    """The views of photos by name, in their order, each once.
+
+    Raises:
+        UserError: The scene has no such photo, or several.
+    """
+    found = [find_view(scene, name) for name in names]
+    return list({view.name: view for view in found}.values())
 
 
 def render_each(
@@ -213,21 +228,31 @@ def render_each(
         yield picture
 
 
+def _is_camera_file(path: str | None) -> bool:
+    return path is not None and path not in (*AROUND, *THROUGH) and bool(Path(path).suffix)
+
+
 def _find_cameras(
-    scene: LoadedScene, trajectory: TrajectoryOptions, views: Sequence[str]
+    scene: LoadedScene, trajectory: TrajectoryOptions, views: Sequence[str], *, one_size: bool
 ) -> tuple[list[Camera], float]:
-    """Cameras and frames per second of the video."""
+    """Cameras and frames per second of the video; `one_size` refuses a file with cameras of several sizes."""
     kind = trajectory.path or ("views" if len(views) > 1 else DEFAULT_PATH)
+    if views and kind not in THROUGH and (kind in AROUND or _is_camera_file(kind)):
+        raise UserError(
+            f"--view is not used on the path {kind}; leave it out, or choose --path still or views"
+        )
     fps = DEFAULT_FPS if trajectory.fps is None else trajectory.fps
     if not 0 < fps <= MAX_FPS:
         raise UserError(f"--fps {fps:g}: must be above 0 and at most {MAX_FPS:,}")
-    if kind not in (*AROUND, *THROUGH) and Path(kind).suffix and trajectory.size is None:
+    if _is_camera_file(kind) and trajectory.size is None:
         if trajectory.seconds is not None:
             raise UserError(f"{kind}: a camera file defines the number of its frames; leave --seconds out")
         cameras, file_fps = read_path(scene.scene, Path(kind))
         sizes = {(camera.width, camera.height) for camera in cameras}
-        if len(sizes) > 1:
-            raise UserError(f"{kind}: the cameras of a video must all have the same image size")
+        if one_size and len(sizes) > 1:
+            raise UserError(
+                f"{kind}: the cameras of a video must all have the same image size; give a folder as --output"
+            )
         return cameras, file_fps if trajectory.fps is None else fps
     seconds = DEFAULT_SECONDS if trajectory.seconds is None else trajectory.seconds
     if not (seconds > 0 and seconds * fps <= MAX_FRAMES):
@@ -237,6 +262,22 @@ def _find_cameras(
         )
     frames = max(1, round(seconds * fps))
     return scene.path(kind, frames=frames, size=trajectory.size, views=views), fps
+
+
+def _write_path(
+    output: Path,
+    scene: LoadedScene,
+    cameras: Sequence[Camera],
+    looks: Sequence[Look] | Timeline,
+    fps: float,
+    progress: Progress | None,
+) -> tuple[int, int]:
+    """Renders the frames of a path into a video or a folder; returns the size of the last one."""
+    if is_video(output):
+        cameras = [_even(camera) for camera in cameras]
+    size = (cameras[-1].width, cameras[-1].height)
+    write_frames(output, _frames(scene, cameras, looks, progress), size, fps)
+    return size
 
 
 def _even(camera: Camera) -> Camera:

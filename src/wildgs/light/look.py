@@ -62,6 +62,14 @@ def own_look(method: Method) -> Look:
     return look_of(method, Appearance(), "own light")
 
 
+def require_look(look: object) -> None:
+    """Raises `UserError` if something else, such as the name of a photo, was given as a look."""
+    if not isinstance(look, Look):
+        raise UserError(
+            f"{str(look)!r} is not an appearance; obtain it first, for example by scene.appearance(name)"
+        )
+
+
 def with_sky(look: Look, sky: Look) -> Look:
     """A look with the sky of another one.
 
@@ -96,6 +104,8 @@ def mix(
     """
     if not looks:
         raise UserError("a mix needs at least one appearance")
+    for look in looks:
+        require_look(look)
     first = looks[0]
     _require_one_scene(looks)
     weights = _checked(looks, weights)
@@ -149,16 +159,18 @@ class Timeline:
     pace: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Checks that there is a look."""
+        """Checks that there is a look, and nothing else."""
         if not self.looks:
             raise UserError("a video needs at least one appearance")
+        for look in self.looks:
+            require_look(look)
 
     @classmethod
     def of(cls, looks: Look | Sequence[Look] | Timeline) -> Timeline:
         """Creates a timeline from one look or several."""
         if isinstance(looks, Timeline):
             return looks
-        return cls((looks,) if isinstance(looks, Look) else tuple(looks))
+        return cls((looks,) if isinstance(looks, Look | str) else tuple(looks))
 
     def at(self, share: float) -> Look:
         """The look at a time from 0 to 1; looks of the sequence are returned without mixing."""

@@ -85,6 +85,10 @@ class LightSources:
         Raises:
             UserError: The photo or file does not exist or cannot be read.
         """
+        if not str(spec):
+            raise UserError(
+                "an appearance without a name: give the name of a photo of the scene, an image file, or 'neutral'"
+            )
         if not self.method.relightable:
             if spec != NEUTRAL:
                 message = f"{self.method.label} cannot be relit; the appearance {spec} is ignored"

@@ -18,6 +18,9 @@ from wildgs.geometry.camera import Camera
 from wildgs.scene.photo_store import PhotoStore
 
 Split = Literal["train", "test"]
+MAX_LISTED = 3
+"""Number of photos that a message names."""
+
 LEAST_PHOTOS = 3
 """Smallest number of photos in which a point is observed to be taken as static."""
 
@@ -242,7 +245,7 @@ def find_view(scene: Scene, name: str) -> View:
     """The view of a photo by its name with or without extension.
 
     Raises:
-        UserError: The scene has no such photo.
+        UserError: The scene has no such photo, or several.
     """
     view = match_view(scene.views, name)
     if view is None:
@@ -253,8 +256,15 @@ def find_view(scene: Scene, name: str) -> View:
 
 
 def match_view(views: Sequence[View], name: str) -> View | None:
-    """The view of a photo by its name with or without extension, or None."""
-    for view in views:
-        if name in (view.name, str(Path(view.name).with_suffix(""))):
-            return view
-    return None
+    """The view of a photo by its name with or without extension, or None.
+
+    Raises:
+        UserError: Several photos have this name without extension.
+    """
+    found = [view for view in views if view.name == name]
+    found = found or [view for view in views if str(Path(view.name).with_suffix("")) == name]
+    if len(found) > 1:
+        several = ", ".join(view.name for view in found[:MAX_LISTED])
+        more = ", …" if len(found) > MAX_LISTED else ""
+        raise UserError(f"{name!r} may be any of {several}{more}; give the name with its extension")
+    return found[0] if found else None
