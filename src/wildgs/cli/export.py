@@ -63,9 +63,9 @@ def run(command: Command) -> None:
     print_notes({look: None for file in written for look in file.looks})
     for file in written:
         size = f"{file.file}: {file.megabytes:.1f} MB, {file.num_gaussians:,} Gaussians"
-        if file.file.suffix in (".html", ".glb", ".usd"):
+        if file.file.suffix.lower() in (".html", ".glb", ".usd"):
             lights = f"{len(file.looks)} lights" if len(file.looks) > 1 else "1 light"
-            hint = "; open it in a browser" if file.file.suffix == ".html" else ""
+            hint = "; open it in a browser" if file.file.suffix.lower() == ".html" else ""
             console.print(f"{size}, {lights}, harmonics of degree {file.sh_degree}{hint}")
         else:
             console.print(f"{size} under {file.looks[0].name}")

@@ -30,7 +30,7 @@ LEAST_FOCAL, MAX_INTRINSIC = 1e-3, 1e9
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A camera path: one camera per video frame, all of the same size, and their world frame."""
+    """A camera path: one camera per frame (for a video all of one size), and their world frame."""
 
     cameras: tuple[Camera, ...]
     fps: float

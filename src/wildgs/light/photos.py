@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
+from torch.nn import functional
 
 from wildgs.geometry.camera import Camera
 from wildgs.model.appearance import Appearance, Embeddings
@@ -110,9 +111,9 @@ class Atlas:
     mean: Embeddings
 
     def most_alike(self, global_embedding: Float[Tensor, " G"]) -> View:
-        """The photo whose global embedding is nearest."""
-        distance = (self.global_embeddings - global_embedding).norm(dim=1)
-        return self.views[int(distance.argmin())]
+        """The photo whose global embedding has the nearest direction; encoded photos keep a part of theirs."""
+        likeness = functional.cosine_similarity(self.global_embeddings, global_embedding[None], dim=1)
+        return self.views[int(likeness.argmax())]
 
 
 @torch.no_grad()
