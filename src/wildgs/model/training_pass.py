@@ -78,7 +78,7 @@ class ParameterGroup:
 
 @dataclass(frozen=True)
 class SeenPhoto:
-    """A training photo for `Method.finish`.
+    """A photo with its camera.
 
     Attributes:
         photo: RGB in [0, 1].

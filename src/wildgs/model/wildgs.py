@@ -196,48 +196,33 @@ class WildGS(Method):
         explicit: bool = True,
     ) -> Appearance:
         """Parses the photo, lifts its static pixels by the rendered depth, builds the triplane, matches colours."""
-        appearance = self.parse(photo)
+        appearance, seen = self.parse(photo), SeenPhoto(photo, camera, keep, name or "")
         if not explicit:
             return appearance
-        if not trust_mask:
-            appearance = replace(appearance, visibility=None)
-        appearance = self._wrapped(photo, camera, keep, appearance)
+        appearance = self._wrapped(seen, appearance if trust_mask else replace(appearance, visibility=None))
         # Without trust in the mask, the image shows another scene, so that comparing pixels is meaningless.
         if not (self.config.color_match and trust_mask):
             return appearance
         assert appearance.global_embedding is not None
         embedding = self.config.embedding_scale * appearance.global_embedding
-        return self._match(photo, camera, keep, replace(appearance, global_embedding=embedding))
+        return self._matched(seen, replace(appearance, global_embedding=embedding))
 
     def _learned_appearance(self, seen: SeenPhoto) -> Appearance:
         """`encode` of a training photo with all of its embedding, as in training."""
-        photo, camera, keep = seen.photo, seen.camera, seen.keep
-        appearance = self._wrapped(photo, camera, keep, self.parse(photo))
-        return self._match(photo, camera, keep, appearance) if self.config.color_match else appearance
+        appearance = self._wrapped(seen, self.parse(seen.photo))
+        return self._matched(seen, appearance) if self.config.color_match else appearance
 
-    def _wrapped(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        camera: Camera,
-        keep: Bool[Tensor, "H W"] | None,
-        appearance: Appearance,
-    ) -> Appearance:
+    def _wrapped(self, seen: SeenPhoto, appearance: Appearance) -> Appearance:
         """Adds the triplane to an appearance from `parse`, if there are local embeddings."""
         if not self._wraps:
             return appearance
         with torch.no_grad():
-            projection = self.gaussians.project(camera)
-        return self.wrap(photo, appearance, projection, keep)
+            projection = self.gaussians.project(seen.camera)
+        return self.wrap(seen.photo, appearance, projection, seen.keep)
 
-    def _match(
-        self,
-        photo: Float[Tensor, "H W 3"],
-        camera: Camera,
-        keep: Bool[Tensor, "H W"] | None,
-        appearance: Appearance,
-    ) -> Appearance:
+    def _matched(self, seen: SeenPhoto, appearance: Appearance) -> Appearance:
         """Adds colour match, light basis and camera response to a predicted appearance."""
-        sight = Sight.reduced(self.gaussians, photo, camera, appearance.visibility, keep)
+        sight = Sight.reduced(self.gaussians, seen.photo, seen.camera, appearance.visibility, seen.keep)
         with torch.no_grad():
             colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
             codes = self.photo_match.landmark_codes(self.gaussians.rows["intrinsic"], self.sky())
