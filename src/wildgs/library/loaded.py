@@ -280,7 +280,7 @@ def _key(scene: LoadedScene, spec: Spec) -> str | Look:
 
 def find_looks(
     scene: LoadedScene,
-    specs: str | Path | Look | Sequence[str | Path | Look],
+    specs: Spec | Sequence[Spec],
     mixing: MixOptions | None = None,
     *,
     progress: Progress | None = None,
@@ -300,7 +300,7 @@ def find_looks(
     if isinstance(specs, str | Path | Look):
         specs = (specs,)
 
-    def find(spec: str | Path | Look) -> Look:
+    def find(spec: Spec) -> Look:
         return scene.appearance(spec, like=mixing.like, progress=progress)
 
     parts = (mixing.global_, mixing.local)
