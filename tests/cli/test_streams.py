@@ -39,16 +39,19 @@ def test_no_file_takes_the_place_of_a_closed_stream(closed: str, tmp_path: Path)
     assert (tmp_path / "file").read_bytes() == b""
 
 
-def test_sigterm_after_pycolmap_was_imported_by_the_work(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("verb", "arguments"), [("gallery", ["run", "--output", "g.png"]), ("doctor", [])])
+def test_sigterm_after_pycolmap_was_imported_by_the_work(
+    verb: str, arguments: list[str], tmp_path: Path
+) -> None:
     """In a process of its own: here, other tests have imported pycolmap before."""
     code = (
         "import importlib, os, signal, sys, time\nfrom pathlib import Path\n"
-        "import wildgs.cli.gallery\nfrom wildgs.cli import main\nfrom wildgs.files import written_aside\n"
+        f"import wildgs.cli.{verb}\nfrom wildgs.cli import main\nfrom wildgs.files import written_aside\n"
         "def work(_):\n"
         "    importlib.import_module('pycolmap')\n"
         "    with written_aside(Path(sys.argv[1]) / 'file'):\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n        time.sleep(5)\n"
-        "wildgs.cli.gallery.run = work\nmain(['gallery', sys.argv[1], '--output', 'g.png'])\n"
+        f"wildgs.cli.{verb}.run = work\nmain({[verb, *arguments]})\n"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -23,6 +23,19 @@ def test_unknown_formats_are_refused(kind: str, scene, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"title": "The gate"}, "--title is only used for html, glb and usd"),
+        ({"spz_version": 3}, "--spz-version is only used for spz"),
+    ],
+)
+def test_options_of_other_formats_are_refused(options, message: str, scene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=message):
+        wildgs.export(scene, ["ply", "sog"], output=tmp_path / "out", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_outputs_are_checked_before_the_work(scene, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(type(scene), "appearance", lambda *_, **__: pytest.fail("encoded"))
     (tmp_path / "file").write_text("")

@@ -12,6 +12,7 @@ from PIL import Image
 import wildgs
 from wildgs.errors import UserError
 from wildgs.geometry.camera_file import write_camera_path
+from wildgs.library.config import MixOptions
 from wildgs.library.rendering import check_size
 
 
@@ -171,3 +172,17 @@ def test_a_loaded_run_stays_where_it_is(trained: Path, tmp_path: Path, monkeypat
     assert written.sheet.is_relative_to(tmp_path / "here")
     wildgs.evaluate(scene, "half")
     assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_pictures_of_one_name_keep_their_own_folders(trained: Path, tmp_path: Path) -> None:
+    for folder, color in (("noon", (220, 220, 200)), ("night", (20, 25, 60))):
+        (tmp_path / folder).mkdir()
+        Image.new("RGB", (32, 24), color).save(tmp_path / folder / "light.png")
+    pictures = [str(tmp_path / folder / "light.png") for folder in ("noon", "night")]
+    view = wildgs.load(trained).scene.test_views[0].name
+    borrowed = MixOptions(like=view)
+    done = wildgs.render(trained, tmp_path / "out", appearance=pictures, views=[view], mixing=borrowed)
+    written = sorted((tmp_path / "out").rglob("*.png"))
+    assert [file.parent.name for file in written] == ["light_0", "light_1"]
+    assert len(written) == done.pictures
+    assert written[0].read_bytes() != written[1].read_bytes()

@@ -8,6 +8,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -113,7 +114,8 @@ def _run(verb: str, arguments: list[str]) -> None:
         command = _parse(verb, module, arguments)
     from wildgs.cli.screen import Lines
 
-    if verb != "doctor":  # doctor reports missing packages itself
+    # doctor reports packages that cannot be imported itself.
+    with suppress(ImportError) if verb == "doctor" else nullcontext():
         importlib.import_module("wildgs.scene")  # before pycolmap, see there
         # Imports pycolmap now: it installs a SIGTERM handler, which would replace ours if it came later.
         importlib.import_module("pycolmap")

@@ -35,7 +35,7 @@ class Command:
     output: Path | None = None
     """Folder for the files, or the file itself if only one is written. Default: RUN/export."""
     title: str | None = None
-    """Title of the web page. Default: the run folder's name."""
+    """Title of html, glb and usd. Default: the run folder's name."""
     aligned: bool = False
     """Use the frame of training (+z up, median depth of the photos = 1) instead of the COLMAP model's."""
     spz_version: Literal[3, 4] = 4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -37,6 +37,16 @@ def picture_paths(names: Iterable[str]) -> dict[str, PurePosixPath]:
         taken.add(str(target).lower())
         paths[name] = target
     return paths
+
+
+def distinct_names(names: Sequence[str]) -> list[str]:
+    """Unique names for `picture_paths`: those of repeated names end with their position in the sequence."""
+    count = Counter(names)
+    paths = [PurePosixPath(name) for name in names]
+    return [
+        str(path.with_stem(f"{path.stem}_{number}")) if count[name] > 1 else name
+        for number, (name, path) in enumerate(zip(names, paths, strict=True))
+    ]
 
 
 def _inside(name: str) -> PurePosixPath:

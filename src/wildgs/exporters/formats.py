@@ -21,6 +21,8 @@ SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog"]
 
 SpzVersion = Literal[3, 4]
 """Versions of .spz: 4 is compressed by Zstandard, 3 by gzip."""
+SPZ_VERSION: SpzVersion = 4
+"""Version that is written by default."""
 
 _LEAST_OPACITY = 1e-6
 """Opacities are kept this far from 0 and 1, so that their logits are finite in single precision."""
@@ -30,7 +32,12 @@ _SPZ_HALF_RANGE = 2**23
 
 
 def write_splats(
-    file: Path, splats: Splats, kind: SplatFormat, *, full_sh: bool = True, spz_version: SpzVersion = 4
+    file: Path,
+    splats: Splats,
+    kind: SplatFormat,
+    *,
+    full_sh: bool = True,
+    spz_version: SpzVersion = SPZ_VERSION,
 ) -> None:
     """Writes Gaussians to a file; missing folders are created.
 

@@ -12,7 +12,7 @@ import torch
 from wildgs.errors import UserError
 from wildgs.evaluation.pictures import picture_paths
 from wildgs.exporters.config import CleanupConfig
-from wildgs.exporters.formats import SplatFormat, SpzVersion, write_splats
+from wildgs.exporters.formats import SPZ_VERSION, SplatFormat, SpzVersion, write_splats
 from wildgs.exporters.glb import glb_bytes
 from wildgs.exporters.lights import ExportLight, RelightableScene, SharedHarmonics, share_harmonics, upright
 from wildgs.exporters.outputs import names_file
@@ -55,7 +55,7 @@ def export(
     title: str | None = None,
     aligned: bool = False,
     cleanup: CleanupConfig | None = None,
-    spz_version: SpzVersion = 4,
+    spz_version: SpzVersion = SPZ_VERSION,
     mixing: MixOptions | None = None,
     progress: Progress | None = None,
 ) -> list[ExportedFile]:
@@ -67,7 +67,7 @@ def export(
         appearance: Anything that `LoadedScene.appearance` accepts. Default: several photos of very different light
             for html, glb and usd; neutral for the others.
         output: Folder for the files, or the file itself if only one is written. Default: RUN/export.
-        title: Title of the web page. Default: the run folder's name.
+        title: Title of html, glb and usd. Default: the run folder's name.
         aligned: Use the frame of training (+z up, median depth of the photos = 1) instead of the COLMAP model's.
         cleanup: What to drop. Unless it sets a degree, .ply files have all 45 coefficients above degree 0, padded
             with zeros.
@@ -81,6 +81,10 @@ def export(
     """
     formats = _known_formats([formats] if isinstance(formats, str) else formats)
     kinds: list[SplatFormat] = [kind for kind in formats if kind not in ("html", "glb", "usd")]
+    if title is not None and len(kinds) == len(formats):
+        raise UserError("--title is only used for html, glb and usd; leave it out")
+    if spz_version != SPZ_VERSION and "spz" not in kinds:
+        raise UserError("--spz-version is only used for spz; leave it out, or add spz to --format")
     scene = loaded(run)
     output = folder_of(run) / "export" if output is None else Path(output)
     appearance = without_repeats(scene, appearance, mixing)

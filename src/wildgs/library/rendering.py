@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from wildgs.errors import UserError
-from wildgs.evaluation.pictures import picture_paths, write_picture
+from wildgs.evaluation.pictures import distinct_names, picture_paths, write_picture
 from wildgs.exporters.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, file_suffix, require_folder
 from wildgs.exporters.video import check_output, is_video, write_frames
 from wildgs.geometry.camera import Camera
@@ -218,12 +218,12 @@ def render_each(
         progress: Called for every image.
     """
     paths = picture_paths([view.name for view in views])
-    folders = picture_paths([look.name for look in looks])
+    folders = picture_paths(distinct_names([look.name for look in looks])).values()
     show = counter(progress, "rendering")
-    for number, (view, look) in enumerate(product(views, looks), start=1):
+    for number, (view, (look, place)) in enumerate(product(views, zip(looks, folders, strict=True)), start=1):
         picture = scene.render(view.camera if size is None else still(view.camera, 1, *size)[0], look)
         if folder is not None:
-            write_picture(folder / folders[look.name].with_suffix("") / paths[view.name], picture)
+            write_picture(folder / place.with_suffix("") / paths[view.name], picture)
         show(number, len(views) * len(looks))
         yield picture
 
