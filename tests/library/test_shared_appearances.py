@@ -30,7 +30,7 @@ def test_the_day_of_a_new_run_encodes_no_photo(
     expected = encode_view(loaded.run.method, view)
     monkeypatch.setattr(photos, "encode_view", lambda *_: pytest.fail("encoded again"))
     found = loaded.encode(view)
-    for name in ("global_embedding", "visibility", "color_map", "basis_weights"):
+    for name in ("global_embedding", "visibility", "color_map", "basis_weights", "sky_profile"):
         # Sums of other threads are rounded differently.
         torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-4)
     assert set(find_day(loaded).phases) == {view.name for view in scene.train_views}

@@ -155,3 +155,18 @@ def test_only_an_appearance_is_replaced(method, look, tmp_path: Path) -> None:
         with pytest.raises(UserError, match="not an appearance file"):
             save_look(look, other)
         assert other.read_bytes() == before
+
+
+def test_a_sky_profile_is_saved(method, look, tmp_path: Path) -> None:
+    """A file without one, of an earlier version, has none."""
+    plain = replace(look.embeddings, sky_profile=None)
+    with_sky = replace(plain, sky_profile=torch.rand(3, 5))
+    for number, embeddings in enumerate((plain, with_sky)):
+        file = save_look(replace(look, embeddings=embeddings), tmp_path / f"{number}.safetensors")
+        found = load_look(method, file).embeddings.sky_profile
+        expected = embeddings.sky_profile
+        assert found is None if expected is None else torch.equal(found, expected)
+    tensors, metadata = load_file(file), safe_open(file, "pt").metadata()
+    save_file(tensors | {"sky_profile": torch.rand(3, 6)}, file, metadata)
+    with pytest.raises(UserError, match="not an appearance file"):
+        load_look(method, file)

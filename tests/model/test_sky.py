@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildgs.geometry.camera import Camera
+from wildgs.geometry.spherical_harmonics import C0
 from wildgs.model.encoder import load_encoder
 from wildgs.model.initial import sky_rows
 from wildgs.model.parsing import ParsingConfig
@@ -111,3 +112,21 @@ def test_the_sky_does_not_grow_unless_configured(tower: tuple[WildGS, Camera]) -
     assert torch.equal(growable, torch.arange(len(growable)) < 1800)
     model.config = replace(model.config, sky=replace(model.config.sky, densify=True))
     assert model.growable() is None
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_behind_the_camera_the_sky_is_that_of_the_photo(complete: bool, tower: tuple[WildGS, Camera]) -> None:
+    model, camera = tower
+    model.config = replace(model.config, sky=replace(model.config.sky, complete=complete))
+    sky = model.sky()
+    assert sky is not None
+    with torch.no_grad():
+        for color in (BLUE, PINK):
+            harmonics = model.shade(model.encode(photo_before(camera, GREY, color), camera))
+            towards = model.gaussians.means - camera.position
+            behind = sky & (towards[:, 1] < -0.5 * towards.norm(dim=1)) & (towards[:, 2] > 2.0)
+            found = 0.5 + C0 * harmonics[behind, 0]
+            agrees = bool(((found - color).abs().amax(dim=1) < 0.05).all())
+            assert agrees or not complete
+    look = model.encode(photo_before(camera, GREY, BLUE), camera)
+    assert (look.sky_profile is not None) == complete

@@ -16,6 +16,7 @@ from wildgs.files import is_there, written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
 from wildgs.model.method import Method
+from wildgs.model.sky_profile import COLUMNS
 
 SUFFIX = ".safetensors"
 FORMAT = "wildgs-appearance-2"
@@ -96,6 +97,8 @@ def _packed(embeddings: Embeddings) -> dict[str, Tensor]:
         tensors["basis_weights"] = embeddings.basis_weights.detach().cpu().contiguous()
     if embeddings.response is not None:
         tensors["response"] = embeddings.response.detach().cpu().contiguous()
+    if embeddings.sky_profile is not None:
+        tensors["sky_profile"] = embeddings.sky_profile.detach().cpu().contiguous()
     if embeddings.local_embeddings is None:
         return tensors
     local = embeddings.local_embeddings.detach().cpu()
@@ -124,8 +127,11 @@ def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     response = tensors.get("response")
     if response is not None and response.shape != (method.response_size,):
         raise ValueError("a camera response of another length")
+    sky_profile = tensors.get("sky_profile")
+    if sky_profile is not None and sky_profile.shape != (3, COLUMNS):
+        raise ValueError("a sky profile of another shape")
     local = _local_embeddings(method, tensors) if method.local_size else None
-    parts = (common, local, color_map, weights, response)
+    parts = (common, local, color_map, weights, response, sky_profile)
     if not all(bool(values.isfinite().all()) for values in parts if values is not None):
         raise ValueError("embeddings that are not finite")
     return Embeddings(*(None if values is None else values.float().to(device) for values in parts))  # type: ignore[arg-type]

@@ -21,6 +21,7 @@ class Appearance:
         color_map: Colour transform that corrects the embedding (`wildgs.model.color_match`), or None.
         basis_weights: Weights that correct both (`wildgs.model.light_basis`), or None.
         response: Response of the photo's camera (`wildgs.model.camera_response`), or None.
+        sky_profile: The photo's sky by elevation (`wildgs.model.sky_profile`), or None.
     """
 
     global_embedding: Float[Tensor, " G"] | None = None
@@ -29,6 +30,7 @@ class Appearance:
     color_map: Float[Tensor, "3 M"] | None = None
     basis_weights: Float[Tensor, " B"] | None = None
     response: Float[Tensor, " Q"] | None = None
+    sky_profile: Float[Tensor, "3 5"] | None = None
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class Embeddings:
         basis_weights: Weights of the components of `wildgs.model.light_basis`, or None.
         response: Response of the camera, applied to pixels, not to Gaussians (`wildgs.model.camera_response`); None
             is the identity.
+        sky_profile: Colours of the sky in directions that the photo does not show (`wildgs.model.sky_profile`), or
+            None.
     """
 
     global_embedding: Float[Tensor, " G"]
@@ -50,6 +54,7 @@ class Embeddings:
     color_map: Float[Tensor, "3 M"] | None = None
     basis_weights: Float[Tensor, " B"] | None = None
     response: Float[Tensor, " Q"] | None = None
+    sky_profile: Float[Tensor, "3 5"] | None = None
 
 
 def blend_embeddings(
@@ -57,7 +62,8 @@ def blend_embeddings(
 ) -> Embeddings:
     """Appearance tuning: Σ w_k f_k on embeddings (paper, appendix Video Demo: two photos, 1 - α and α).
 
-    Colour maps, basis weights and camera responses are mixed like global embeddings.
+    Colour maps, basis weights and camera responses are mixed like global embeddings, and the sky profiles of the
+    parts that have one by their share of the weights.
 
     Args:
         parts: Embeddings for the same Gaussians, at least one.
@@ -72,26 +78,33 @@ def blend_embeddings(
         _mixed([part.color_map for part in parts], weights),
         _mixed([part.basis_weights for part in parts], weights),
         _mixed([part.response for part in parts], weights),
+        _mixed_profiles([part.sky_profile for part in parts], weights),
     )
 
 
 def mean_embeddings(parts: Iterable[Embeddings], count: int) -> Embeddings:
     """The mean of `count` embeddings, of which only one is in memory at a time.
 
-    Colour maps and basis weights are averaged over the parts that have them. The mean has no camera response.
+    Colour maps, basis weights and sky profiles are averaged over the parts that have them. The mean has no camera
+    response.
     """
-    total_global, maps, basis, local_mean = [], [], [], None
+    total_global, maps, basis, skies, local_mean = [], [], [], [], None
     for part in parts:
         total_global.append(part.global_embedding)
         if part.color_map is not None:
             maps.append(part.color_map)
         if part.basis_weights is not None:
             basis.append(part.basis_weights)
+        if part.sky_profile is not None:
+            skies.append(part.sky_profile)
         if part.local_embeddings is not None:
             local = part.local_embeddings / count
             local_mean = local if local_mean is None else local_mean.add_(local)
-    color_map, weights = (torch.stack(found).mean(dim=0) if found else None for found in (maps, basis))
-    return Embeddings(torch.stack(total_global).mean(dim=0), local_mean, color_map, weights)
+    means = [torch.stack(found).mean(dim=0) if found else None for found in (maps, basis, skies)]
+    color_map, weights, sky_profile = means
+    return Embeddings(
+        torch.stack(total_global).mean(dim=0), local_mean, color_map, weights, sky_profile=sky_profile
+    )
 
 
 def _mixed(values: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor | None:
@@ -100,6 +113,15 @@ def _mixed(values: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor 
     if not present:
         return None
     return _weighted([torch.zeros_like(present[0]) if x is None else x for x in values], weights)
+
+
+def _mixed_profiles(values: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor | None:
+    """Σ w x / Σ w over the parts that have a value: no sky is not a black one."""
+    present = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
+    total = sum(weight for _, weight in present)
+    if total <= 0:
+        return None
+    return _weighted([value for value, _ in present], [weight / total for _, weight in present])
 
 
 def _weighted(values: Sequence[Tensor], weights: Sequence[float]) -> Tensor:

@@ -136,6 +136,8 @@ class SkyConfig:
             Gaussians.
         own_fusion: Predict the colours of sky Gaussians by a fusion network of their own, because clouds and haze
             follow other rules than the light on surfaces.
+        complete: In directions that a photo does not show, take the colours of the sky from the part that it shows
+            (`wildgs.model.sky_profile`).
     """
 
     points: int = 5000
@@ -145,6 +147,7 @@ class SkyConfig:
     opacity: float = 0.5
     densify: bool = False
     own_fusion: bool = True
+    complete: bool = True
 
 
 @dataclass(frozen=True)

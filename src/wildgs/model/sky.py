@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from wildgs.model.config import SkyConfig
 
@@ -62,6 +63,13 @@ def sine_of_elevation(
     """Sine of the elevation of points in the aligned frame, seen from the scene's centre."""
     offsets = points - centre
     return offsets[..., 2] / offsets.norm(dim=-1).clamp_min(1e-6)
+
+
+def sky_directions(
+    points: Float[Tensor, "*batch 3"], centre: Float[Tensor, " 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Unit vectors from the scene's centre to points."""
+    return functional.normalize(points - centre, dim=-1)
 
 
 def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor, "S 3"]:

@@ -16,6 +16,7 @@ from wildgs.model.camera_response import RESPONSE_SIZE
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.dropout import opacity_factors
 from wildgs.model.encoder import Encoder, encoder_of
+from wildgs.model.encoding import corrected
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import (
     GEOMETRY_ROWS,
@@ -30,7 +31,8 @@ from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
 from wildgs.model.photo_match import PhotoMatch, Sight
-from wildgs.model.sky import SKY_SHARE, is_sky
+from wildgs.model.sky import SKY_SHARE, is_sky, sky_directions
+from wildgs.model.sky_profile import complete_sky
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
@@ -124,7 +126,7 @@ class WildGS(Method):
         """Gaussians far from the scene; see `wildgs.model.sky.is_sky`."""
         if not self.config.sky.points:
             return None
-        return is_sky(self.config.sky, self.gaussians.means.detach(), self._centre)
+        return is_sky(self.config.sky, self.gaussians.means.detach(), self.centre)
 
     def row_rates(self) -> dict[str, LearningRate]:
         """Learning rate of f^in."""
@@ -205,12 +207,12 @@ class WildGS(Method):
             return appearance
         assert appearance.global_embedding is not None
         embedding = self.config.embedding_scale * appearance.global_embedding
-        return self._matched(seen, replace(appearance, global_embedding=embedding))
+        return corrected(self, seen, replace(appearance, global_embedding=embedding))
 
     def _learned_appearance(self, seen: SeenPhoto) -> Appearance:
         """`encode` of a training photo with all of its embedding, as in training."""
         appearance = self._wrapped(seen, self.parse(seen.photo))
-        return self._matched(seen, appearance) if self.config.color_match else appearance
+        return corrected(self, seen, appearance) if self.config.color_match else appearance
 
     def _wrapped(self, seen: SeenPhoto, appearance: Appearance) -> Appearance:
         """Adds the triplane to an appearance from `parse`, if there are local embeddings."""
@@ -220,24 +222,9 @@ class WildGS(Method):
             projection = self.gaussians.project(seen.camera)
         return self.wrap(seen.photo, appearance, projection, seen.keep)
 
-    def _matched(self, seen: SeenPhoto, appearance: Appearance) -> Appearance:
-        """Adds colour match, light basis and camera response to a predicted appearance."""
-        sight = Sight.reduced(self.gaussians, seen.photo, seen.camera, appearance.visibility, seen.keep)
-        with torch.no_grad():
-            colors = self.paint(sight.projection, appearance, self.sh_degree, clamped=False)
-            codes = self.photo_match.landmark_codes(self.gaussians.rows["intrinsic"], self.sky())
-            values = torch.cat([colors, codes], dim=1)
-            picture = self.photo_match.picture(sight.projection, values, self._centre)
-            change = self.photo_match.find(sight, picture)
-        appearance = self.light_basis.fit(self, sight, replace(appearance, color_map=change))
-        if not self.response_size:
-            return appearance
-        with torch.no_grad():
-            rendering = blend(sight.projection, self.paint(sight.projection, appearance, self.sh_degree))
-        return replace(appearance, response=self.photo_match.response(sight, rendering))
-
     @property
-    def _centre(self) -> Float[Tensor, " 3"]:
+    def centre(self) -> Float[Tensor, " 3"]:
+        """Centre of the scene, from which directions of the sky are seen."""
         return (self.wrapping.low + self.wrapping.high) / 2
 
     def visibility(self, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"] | None:
@@ -318,17 +305,32 @@ class WildGS(Method):
             appearance.color_map,
             appearance.basis_weights,
             appearance.response,
+            appearance.sky_profile,
         )
 
     def fuse(self, embeddings: Embeddings, rows: Int[Tensor, " V"] | None = None) -> Float[Tensor, "N K 3"]:
-        """Spherical harmonics sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) of the given Gaussians, plus the light basis."""
+        """Spherical harmonics sh = M^F(Emb^g ⊕ Emb^l ⊕ f^in) of the given Gaussians, corrected as in `encode`."""
         means, intrinsic = self.gaussians.means, self.gaussians.rows["intrinsic"]
         if rows is not None:
             means, intrinsic = take_rows(means, rows), take_rows(intrinsic, rows)
         harmonics = self._fused(embeddings, means, intrinsic)
-        if embeddings.basis_weights is None:
+        if embeddings.basis_weights is not None:
+            harmonics = harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
+        return self._with_sky_beyond(harmonics, embeddings.sky_profile, means)
+
+    def _with_sky_beyond(
+        self,
+        harmonics: Float[Tensor, "V K 3"],
+        profile: Float[Tensor, "3 5"] | None,
+        means: Float[Tensor, "V 3"],
+    ) -> Float[Tensor, "V K 3"]:
+        """Completes the sky of a photo by its profile."""
+        sky = None if profile is None else self.photo_match.sky(means, self.centre)
+        if profile is None or sky is None:
             return harmonics
-        return harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
+        rows = sky.which.nonzero()[:, 0]
+        directions = sky_directions(means.detach()[rows], self.centre)
+        return harmonics.index_copy(0, rows, complete_sky(harmonics[rows], profile, directions))
 
     def _fused(
         self, embeddings: Embeddings, means: Float[Tensor, "V 3"], intrinsic: Float[Tensor, "V I"]
@@ -336,7 +338,7 @@ class WildGS(Method):
         """Spherical harmonics by the fusion network and the colour match."""
         common, local = embeddings.global_embedding, embeddings.local_embeddings
         assert local is not None
-        change, sky = embeddings.color_map, self.photo_match.sky(means, self._centre)
+        change, sky = embeddings.color_map, self.photo_match.sky(means, self.centre)
         which = None if sky is None else sky.which
         network_input = self._network_input(intrinsic)
         if change is None or change.shape[1] == 4:
@@ -380,7 +382,7 @@ class WildGS(Method):
         sight = Sight(photo, projection, appearance.visibility, keep)
         if matched:
             colors = self.photo_match.matched(
-                colors, codes, means[landmark:], rows, self.num_gaussians, sight, self._centre
+                colors, codes, means[landmark:], rows, self.num_gaussians, sight, self.centre
             ).clamp_min(0)
         colors = spread_rows(colors, rows, self.num_gaussians)
         rendering = blend(projection, colors)
