@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from wildgs.engine.density import STRATEGIES
 from wildgs.engine.schedule import Schedule, ScheduleConfig, exponential
 from wildgs.errors import UserError
 from wildgs.model.vanilla import VanillaGS
@@ -19,6 +20,16 @@ def test_paper_length_keeps_the_papers_steps() -> None:
     assert not schedule.densifies(650)
     assert not schedule.densifies(15_000)
     assert [step for step in range(0, 30_000) if schedule.resets(step)] == [3000, 6000, 9000, 12_000]
+
+
+@pytest.mark.parametrize("steps", [1500, 6000, 12_000, 30_000])
+def test_relocation_has_as_many_rounds_in_long_runs(steps: int) -> None:
+    """A round replaces a tenth of the Gaussians, which have to be trained again."""
+    strategy = STRATEGIES["relocation"]
+    schedule = Schedule(ScheduleConfig(), steps, 0, strategy.until, every=strategy.every)
+    assert 18 <= sum(map(schedule.densifies, range(steps))) <= 24
+    often = Schedule(ScheduleConfig(densify_every=500), steps, 0, strategy.until, every=strategy.every)
+    assert often.densify_every == max(50, steps // 60)
 
 
 def test_densification_can_be_switched_off() -> None:

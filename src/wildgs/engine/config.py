@@ -19,7 +19,8 @@ class ScheduleConfig:
         densify_from: Step of the first densification (3DGS: 500).
         densify_until: Step of the last densification and opacity reset. Default: 24,000 with the strategy
             relocation, 25,000 with mcmc, 15,000 (3DGS) with classic and absgrad.
-        densify_every: Steps between densifications (3DGS: 100); 0 = no densification, pruning or opacity resets.
+        densify_every: Steps between densifications; 0 = no densification, pruning or opacity resets. Default: 1,000
+            with the strategy relocation, 100 (3DGS) with the others.
         reset_every: Steps between opacity resets; 0 = no resets. Default: 3,000 for 3dgs and affine; 0 for
             wildgs and for the strategies relocation and mcmc.
         mask_pause: Steps after an opacity reset during which the mask is not trained, because it would mistake the
@@ -37,7 +38,7 @@ class ScheduleConfig:
     first_stage: int = 3000
     densify_from: int = 500
     densify_until: int | None = None
-    densify_every: int = 100
+    densify_every: int | None = None
     reset_every: int | None = None
     mask_pause: int = 500
     sh_every: int = 1000

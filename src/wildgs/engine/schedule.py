@@ -38,6 +38,7 @@ class Schedule:
         reset_every: int = 3000,
         until: float = 0.5,
         photos: int | None = None,
+        every: int = 100,
     ) -> None:
         """Scales a configuration to the length of a run.
 
@@ -47,6 +48,7 @@ class Schedule:
             reset_every: Steps between opacity resets unless configured; the method's default.
             until: Fraction of the run in which Gaussians are densified unless configured; the strategy's default.
             photos: Number of training photos, if their masks may become final.
+            every: Steps between densifications unless configured; the strategy's default.
         """
         self.steps = steps
         self.encoder_every = config.encoder_every
@@ -60,11 +62,10 @@ class Schedule:
         self.densify_from = self._scaled(config.densify_from, "densify_from")
         last = round(until * REFERENCE_STEPS) if config.densify_until is None else config.densify_until
         self.densify_until = self._scaled(last, "densify_until")
-        self.densify_every = (
-            self._scaled(config.densify_every, "densify_every") if config.densify_every else 0
-        )
+        every = every if config.densify_every is None else config.densify_every
+        self.densify_every = self._scaled(every, "densify_every") if every else 0
         resets = reset_every if config.reset_every is None else config.reset_every
-        self.reset_every = self._scaled(resets, "reset_every") if resets and config.densify_every else 0
+        self.reset_every = self._scaled(resets, "reset_every") if resets and every else 0
         self.mask_pause = self._scaled(config.mask_pause, "mask_pause")
         self.sh_every = self._scaled(config.sh_every, "sh_every")
 

@@ -91,7 +91,9 @@ class Trainer:
         strategy = STRATEGIES[config.density.strategy or method.density]
         resets = method.reset_every if strategy.resets else 0
         photos = len(self.views) if method.masks_become_final else None
-        self.schedule = Schedule(config.schedule, config.steps, resets, strategy.until, photos)
+        self.schedule = Schedule(
+            config.schedule, config.steps, resets, strategy.until, photos, strategy.every
+        )
         lay_out_channels_last(method)
         extent = scene_extent(scene)
         self.optimizers = Optimizers.build(method, config.optimizer, extent, self.team.size, config.steps)

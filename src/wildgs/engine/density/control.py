@@ -78,6 +78,8 @@ class DensityControl(ABC):
     """Whether the strategy includes opacity resets."""
     until: float = 0.5
     """Share of the training steps after which densification ends."""
+    every: int = 100
+    """Steps between densifications in a run of 30,000 steps."""
     absgrad: bool = False
     """Whether the strategy needs `Projection.absgrad`."""
     perturbs: bool = False

@@ -37,6 +37,9 @@ class RelocationDensity(DensityControl):
 
     resets = False
     until = 0.8
+    # Every round replaces up to a tenth of the Gaussians, which have to be trained again: two dozen rounds are
+    # enough for runs of any length, and hundreds prune what small Gaussians had learnt.
+    every = 1000
 
     def _clear(self, num_gaussians: int) -> None:
         super()._clear(num_gaussians)
