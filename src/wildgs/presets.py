@@ -41,6 +41,7 @@ _PAPER: dict[str, Any] = {
     "model.ground.points": 0,
     "model.sky.points": 0,
     "model.sky.densify": True,
+    "model.sky.complete": False,
     "model.color_match": False,
     "model.camera_response.vignetting": False,
     "model.camera_response.curve": False,
