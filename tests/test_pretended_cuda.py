@@ -32,7 +32,7 @@ def output(landmark: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment.pop("WILDGS_WITHOUT", None)
     command = [sys.executable, str(ROOT / "tests" / "pretended_cuda.py"), str(landmark), str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=800)
-    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.returncode == 0, f"{done.stderr[:2000]}\n...\n{done.stderr[-1000:]}"
     return folder
 
 

@@ -24,9 +24,11 @@ HORIZON, FREE = 0.02, 0.15
 """Sines of the elevations between which the profile starts to count. Below is ground, water or haze."""
 LEAST_PIXELS = 64
 """Smallest number of sky pixels for a profile."""
-RIDGE, PRIOR_WEIGHT = 3e-4, 2e-3
-"""Ridge on the slope and the curvature, and weight of the assumption that the sky has its mean colour at all
-elevations, relative to the photo's sky pixels."""
+RIDGE = torch.tensor([0.0, 3e-4, 3e-4])
+"""Ridge on the constant, the slope and the curvature."""
+PRIOR_SINES, PRIOR_WEIGHT = torch.linspace(0, 1, 6), 2e-3
+"""Sines of elevations at which the sky is assumed to have its usual colour, and weight of this assumption relative
+to the photo's sky pixels."""
 ROUNDS, OUTLIER = 6, 0.05
 """Iterations of reweighted least squares, and the residual at which a weight is halved (clouds, people, poles)."""
 MOST_PIXELS = 20_000
@@ -71,10 +73,9 @@ def fit_sky_profile(
 def _polynomial(colors: Float[Tensor, "P 3"], sines: Float[Tensor, "P"]) -> Float[Tensor, "3 3"]:
     """Coefficients of the colours' polynomial."""
     terms, target = _powers(sines).double(), colors.double()
-    prior = _powers(torch.linspace(0, 1, 6, dtype=torch.float64, device=colors.device))
+    prior = _powers(PRIOR_SINES.to(target))
     usual = target.median(dim=0).values.expand(len(prior), 3)
-    ridge = RIDGE * torch.diag(terms.new_tensor([0.0, 1.0, 1.0]))
-    ridge += PRIOR_WEIGHT / len(prior) * prior.T @ prior
+    ridge = RIDGE.to(target).diag_embed() + PRIOR_WEIGHT / len(prior) * prior.T @ prior
     right = PRIOR_WEIGHT / len(prior) * prior.T @ usual
     trusted = torch.ones_like(terms[:, :1])
     found = torch.zeros_like(ridge)
