@@ -39,6 +39,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.density.reset_opacity": (1e-6, 1),
     "train.density.max_gaussians": (1, _MAX_VALUE),
     "train.density.grow_share": (0, 1),
+    "train.density.prune_share": (0, 1),
     "train.density.grow_error": (0, _MAX_VALUE),
     "train.density.least_pixels": (0, _MAX_VALUE),
     "train.density.min_visibility": (0, 1),

@@ -15,7 +15,7 @@ from wildgs.model.vanilla import VanillaConfig, VanillaGS
 from wildgs.rasterize import blend
 
 SIDE = 32
-CONFIG = DensityConfig(max_gaussians=8, grow_share=0.25, grow_error=0.0)
+CONFIG = DensityConfig(max_gaussians=8, grow_share=0.25, prune_share=0.25, grow_error=0.0)
 
 
 @pytest.fixture
@@ -132,3 +132,16 @@ def test_what_is_known_moves_with_the_gaussians_and_through_a_checkpoint(method:
     assert {name: value.tolist() for name, value in other.state().items()} == {
         name: value.tolist() for name, value in control.state().items()
     }
+
+
+@pytest.mark.parametrize(("grow", "prune"), [(0.4, 0.2), (0.2, 0.4)])
+def test_shares_that_grow_and_that_are_pruned_are_limited_separately(
+    grow: float, prune: float, method: VanillaGS
+) -> None:
+    """A budget that is not spent fills up faster than Gaussians are replaced."""
+    config = replace(CONFIG, grow_share=grow, prune_share=prune, least_pixels=1e6)
+    control = RelocationDensity(config, 1.0, 5)
+    for _ in range(2):
+        control.gather(view_of(method, (slice(0, SIDE), slice(0, SIDE))))
+    report = round_of(control, method)
+    assert (report.split, report.pruned) == (round(5 * grow), round(5 * prune))

@@ -106,7 +106,9 @@ class DensityConfig:
         reset_opacity: Upper bound to which an opacity reset lowers opacities.
         reset_unseen: Also reset Gaussians that no photo has seen yet, as 3DGS does; no photo would raise their
             opacity again.
-        grow_share: Strategy relocation: largest fraction of the Gaussians split, and pruned, at a time.
+        grow_share: Strategy relocation: largest fraction of the Gaussians split at a time.
+        prune_share: Strategy relocation: largest fraction of the Gaussians pruned at a time, apart from transparent
+            ones.
         grow_error: Strategy relocation: do not split Gaussians that cover less error (sum over pixels, mean over
             the photos that see them).
         least_pixels: Strategy relocation: prune Gaussians that cover fewer pixels in every photo.
@@ -126,7 +128,8 @@ class DensityConfig:
     prune_reach: float = 0.15
     reset_opacity: float = 0.01
     reset_unseen: bool = False
-    grow_share: float = 0.1
+    grow_share: float = 0.2
+    prune_share: float = 0.1
     grow_error: float = 0.02
     least_pixels: float = 1.0
     min_visibility: float = 0.8

@@ -86,13 +86,13 @@ class RelocationDensity(DensityControl):
         growable: Bool[Tensor, "N"] | None = None,
         sort: bool = False,
     ) -> DensityReport:
-        """Splits and prunes; the counts are limited by `grow_share`, the error threshold, and the budget."""
+        """Splits and prunes, limited by `grow_share`, `prune_share`, the error threshold, and the budget."""
         count = len(gaussians)
         fixed = torch.zeros_like(gaussians.opacities, dtype=torch.bool) if growable is None else ~growable
-        most = max(1, round(self.config.grow_share * count))
-        prune = self._select_useless(gaussians, fixed, most)
+        prune = self._select_useless(gaussians, fixed, max(1, round(self.config.prune_share * count)))
         pruned = int(prune.sum())
         room = self.config.max_gaussians - count + pruned
+        most = max(1, round(self.config.grow_share * count))
         split = self._select_high_error(fixed | prune, min(most, room))
         keep = ~prune
         keep[split] = False
