@@ -33,6 +33,7 @@ MENDED = {
     "train.dropout.rate": 0.0,
     "train.flat_ground.rate": 0.0,
     "model.sky.densify": True,
+    "model.sky.complete": False,
     "model.color_match": False,
     "model.light_codes": 0,
     "model.eps2d": 0.3,
