@@ -12,7 +12,7 @@ from torch import Tensor
 from wildgs.model.appearance import Appearance
 from wildgs.model.photo_match import Picture, Sight
 from wildgs.model.sky import sky_directions
-from wildgs.model.sky_profile import fit_sky_profile
+from wildgs.model.sky_profile import complete_sky, fit_sky_profile
 from wildgs.model.training_pass import SeenPhoto
 from wildgs.model.wrapping import MIN_ALPHA
 from wildgs.rasterize import blend
@@ -62,3 +62,25 @@ def sky_profile(sight: Sight, picture: Picture, centre: Float[Tensor, " 3"]) -> 
         shown = shown & sight.keep
     points = sight.projection.camera.unproject(picture.rendering.depth)[shown]
     return fit_sky_profile(sight.photo[shown], sky_directions(points, centre))
+
+
+def with_sky_beyond(
+    model: WildGS,
+    harmonics: Float[Tensor, "V K 3"],
+    profile: Float[Tensor, "3 5"],
+    means: Float[Tensor, "V 3"],
+) -> Float[Tensor, "V K 3"]:
+    """Harmonics of Gaussians whose sky is completed by a profile; unchanged for a scene without sky.
+
+    Args:
+        model: The method.
+        harmonics: Relative to grey.
+        profile: From `sky_profile`.
+        means: Centres of the Gaussians.
+    """
+    sky = model.photo_match.sky(means, model.centre)
+    if sky is None:
+        return harmonics
+    rows = sky.which.nonzero()[:, 0]
+    directions = sky_directions(means.detach()[rows], model.centre)
+    return harmonics.index_copy(0, rows, complete_sky(harmonics[rows], profile, directions))

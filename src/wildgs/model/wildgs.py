@@ -16,7 +16,7 @@ from wildgs.model.camera_response import RESPONSE_SIZE
 from wildgs.model.config import Ablation, InitialConfig, LearningRate, MemoryUse, WildGSConfig
 from wildgs.model.dropout import opacity_factors
 from wildgs.model.encoder import Encoder, encoder_of
-from wildgs.model.encoding import corrected
+from wildgs.model.encoding import corrected, with_sky_beyond
 from wildgs.model.fusion import Fusion
 from wildgs.model.gaussians import (
     GEOMETRY_ROWS,
@@ -31,8 +31,7 @@ from wildgs.model.light_basis import LightBasis
 from wildgs.model.method import Method
 from wildgs.model.parsing import Parsing
 from wildgs.model.photo_match import PhotoMatch, Sight
-from wildgs.model.sky import SKY_SHARE, is_sky, sky_directions
-from wildgs.model.sky_profile import complete_sky
+from wildgs.model.sky import SKY_SHARE, is_sky
 from wildgs.model.training_pass import ParameterGroup, SeenPhoto, Stage, TrainingOutput
 from wildgs.model.triplane import Box, robust_box
 from wildgs.model.wrapping import Wrapping, lift, liftable, random_part
@@ -316,21 +315,8 @@ class WildGS(Method):
         harmonics = self._fused(embeddings, means, intrinsic)
         if embeddings.basis_weights is not None:
             harmonics = harmonics + self.light_basis.harmonics(embeddings.basis_weights, rows)
-        return self._with_sky_beyond(harmonics, embeddings.sky_profile, means)
-
-    def _with_sky_beyond(
-        self,
-        harmonics: Float[Tensor, "V K 3"],
-        profile: Float[Tensor, "3 5"] | None,
-        means: Float[Tensor, "V 3"],
-    ) -> Float[Tensor, "V K 3"]:
-        """Completes the sky of a photo by its profile."""
-        sky = None if profile is None else self.photo_match.sky(means, self.centre)
-        if profile is None or sky is None:
-            return harmonics
-        rows = sky.which.nonzero()[:, 0]
-        directions = sky_directions(means.detach()[rows], self.centre)
-        return harmonics.index_copy(0, rows, complete_sky(harmonics[rows], profile, directions))
+        profile = embeddings.sky_profile
+        return harmonics if profile is None else with_sky_beyond(self, harmonics, profile, means)
 
     def _fused(
         self, embeddings: Embeddings, means: Float[Tensor, "V 3"], intrinsic: Float[Tensor, "V I"]
