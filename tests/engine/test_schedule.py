@@ -24,7 +24,7 @@ def test_paper_length_keeps_the_papers_steps() -> None:
 
 @pytest.mark.parametrize("steps", [1500, 6000, 12_000, 30_000])
 def test_relocation_has_as_many_rounds_in_long_runs(steps: int) -> None:
-    """A round replaces a tenth of the Gaussians, which have to be trained again."""
+    """A round splits many Gaussians, which have to be trained again."""
     strategy = STRATEGIES["relocation"]
     schedule = Schedule(ScheduleConfig(), steps, 0, strategy.until, every=strategy.every)
     assert 18 <= sum(map(schedule.densifies, range(steps))) <= 24

@@ -37,8 +37,8 @@ class RelocationDensity(DensityControl):
 
     resets = False
     until = 0.8
-    # Every round replaces up to a tenth of the Gaussians, which have to be trained again: two dozen rounds are
-    # enough for runs of any length, and hundreds prune what small Gaussians had learnt.
+    # Gaussians that were split have to be trained again, at first with too large steps: two dozen rounds are enough
+    # for runs of any length, and with hundreds many Gaussians never settle.
     every = 1000
 
     def _clear(self, num_gaussians: int) -> None:
