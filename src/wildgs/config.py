@@ -66,6 +66,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "model.depth_points.agreement": (0, 1),
     "model.ground.points": (0, 1e7),
     "model.ground.spacing": (1e-4, 1e3),
+    "model.ground.most_pixels": (0, 1e6),
     "model.sky.points": (0, 1e7),
     "model.sky.radius": (1e-3, 1e6),
     "model.sky.reach": (0, 1e6),

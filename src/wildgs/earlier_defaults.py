@@ -17,6 +17,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("model", "sky", "densify"): ("lowest", True),
     ("model", "sky", "own_fusion"): ("lowest", False),
     ("model", "sky", "complete"): ("lowest", False),
+    ("model", "ground", "most_pixels"): ("spacing", 0.0),
     ("train", "optimizer", "short_runs"): ("batch_scaling", 0.0),
     ("train", "objective", "mask_weight_photos"): ("mask_weight_end", 0),
     ("train", "objective", "mask_power"): ("mask_weight_end", 1.0),

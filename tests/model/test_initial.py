@@ -23,6 +23,7 @@ from wildgs.model.initial import (
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import METHODS, method_type
 from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.priors.ground import GroundPoints
 from wildgs.rasterize import blend
 from wildgs.scene import Alignment, Scene
 
@@ -34,7 +35,7 @@ def grid(spacing: float) -> torch.Tensor:
 
 def test_who_stands_on_it_sees_no_hole() -> None:
     """A camera 0.2 above the ground that looks down at it: all is covered, at the right depth."""
-    gaussians = Gaussians(ground_rows(grid(0.04), 0.04))
+    gaussians = Gaussians(ground_rows(grid(0.04), torch.full((len(grid(0.04)),), 0.04)))
     tilt = torch.tensor(0.6)
     forward = torch.stack([torch.zeros(()), tilt.cos(), -tilt.sin()])
     right = torch.tensor([1.0, 0.0, 0.0])
@@ -55,11 +56,11 @@ def test_models_have_it_where_it_is_given() -> None:
     torch.manual_seed(0)
     points, colors = torch.rand(30, 3), torch.randint(0, 256, (30, 3), dtype=torch.uint8)
     config = WildGSConfig(parsing=ParsingConfig(max_side=32), sky=SkyConfig(points=0))
-    ground = grid(0.5), torch.full((16, 3), 200, dtype=torch.uint8)
+    ground = GroundPoints(grid(0.5), torch.full((16, 3), 200, dtype=torch.uint8), torch.full((16,), 0.5))
     initial = initial_from_points(WildGS.initial(config), points, colors, ground=ground)
     model = WildGS.create(config, initial, load_encoder(None))
     assert len(model.gaussians) == 30 + 16
-    assert torch.equal(model.gaussians.means[30:].detach(), ground[0])
+    assert torch.equal(model.gaussians.means[30:].detach(), ground.points)
     sh0 = model.fusion.initial_intrinsic(torch.full((1, 3), 200 / 255))[0, :3]
     torch.testing.assert_close(model.gaussians.rows["intrinsic"][30:, :3].detach(), sh0.expand(16, 3))
 

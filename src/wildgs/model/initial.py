@@ -11,12 +11,14 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from wildgs.errors import WildGSWarning
+from wildgs.geometry.camera import Camera
 from wildgs.model.config import InitialConfig, SkyConfig
 from wildgs.model.gaussians import geometry_from_points
 from wildgs.model.sky import COLOR as SKY_COLOR
 from wildgs.model.sky import sky_points
+from wildgs.priors.config import GroundConfig
 from wildgs.priors.depth_points import depth_points
-from wildgs.priors.ground import ground_points
+from wildgs.priors.ground import GroundPoints, ground_plane, ground_points
 from wildgs.scene import Scene
 
 ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
@@ -89,13 +91,25 @@ def initial_gaussians(
     taken += len(dense[0])
     wanted_ground = replace(config.ground, points=budget.further(config.ground.points, taken))
     points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
-    centers = [view.camera.position for view in scene.train_views]
-    no_points = (points[:0], colors[:0])
-    ground = (
-        ground_points(points, colors, torch.stack(centers), wanted_ground, seed) if centers else no_points
+    cameras = [view.camera for view in scene.train_views]
+    ground = ground_points(
+        points, colors, _ground(sparse[0], points, cameras, wanted_ground), cameras, wanted_ground
     )
     names = [view.name for view in scene.train_views]
     return initial_from_points(replace(config, sky=sky), *sparse, dense=dense, ground=ground, photos=names)
+
+
+def _ground(
+    sparse: Float[Tensor, "P 3"],
+    surface: Float[Tensor, "Q 3"],
+    cameras: Sequence[Camera],
+    config: GroundConfig,
+) -> Float[Tensor, "3"] | None:
+    """The ground plane, as in `wildgs.engine.flat_ground`; None without one or if no ground is wanted."""
+    if not (cameras and config.points):
+        return None
+    centers = torch.stack([camera.position for camera in cameras])
+    return ground_plane(sparse, lambda: surface, centers, config.tolerance)
 
 
 def initial_from_points(
@@ -104,13 +118,13 @@ def initial_from_points(
     colors: UInt8[Tensor, "P 3"],
     *,
     dense: ColoredPoints | None = None,
-    ground: ColoredPoints | None = None,
+    ground: GroundPoints | None = None,
     photos: Sequence[str] = (),
 ) -> InitialGaussians:
     """Creates initial Gaussians from given points, and the sky.
 
     Args:
-        config: Configuration of the sky, and of the ground's spacing.
+        config: Configuration of the sky.
         points: SfM points in the aligned frame.
         colors: Their colours.
         dense: Further points from depth maps.
@@ -122,7 +136,7 @@ def initial_from_points(
         surface, surface_colors = torch.cat([points, dense[0]]), torch.cat([colors, dense[1]])
     parts = [(geometry_from_points(surface), surface_colors.float() / 255)]
     if ground is not None:
-        parts.append((ground_rows(ground[0], config.ground.spacing), ground[1].float() / 255))
+        parts.append((ground_rows(ground.points, ground.spacing), ground.colors.float() / 255))
     if config.sky.points:
         parts.append((sky_rows(config.sky, points), torch.full((config.sky.points, 3), SKY_COLOR)))
     return InitialGaussians(
@@ -134,19 +148,19 @@ def initial_from_points(
     )
 
 
-def ground_rows(points: Float[Tensor, "G 3"], spacing: float) -> dict[str, Tensor]:
+def ground_rows(points: Float[Tensor, "G 3"], spacing: Float[Tensor, " G"]) -> dict[str, Tensor]:
     """Geometry of the ground's Gaussians: thin horizontal discs, initially nearly opaque.
 
     Args:
         points: Their centres in the aligned frame.
-        spacing: Distance between neighbours, world units.
+        spacing: Distance of each one from its neighbours, world units.
     """
     count = len(points)
-    scales = spacing * torch.tensor([GROUND_WIDTH, GROUND_WIDTH, GROUND_THICKNESS])
+    scales = spacing[:, None] * torch.tensor([GROUND_WIDTH, GROUND_WIDTH, GROUND_THICKNESS])
     return {
         "means": points.float().clone(),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        "log_scales": scales.log().repeat(count, 1),
+        "log_scales": scales.log(),
         "opacity_logits": torch.full((count,), GROUND_OPACITY).logit(),
     }
 

@@ -37,12 +37,15 @@ class GroundConfig:
     Attributes:
         points: Upper bound on the number of points; 0 = none, as in the paper.
         spacing: Distance between points, in units of the aligned frame (median depth of the photos = 1).
+        most_pixels: Largest distance between neighbouring points in a training photo, in pixels. Where photos are
+            nearer, points are denser. 0 = the same distance everywhere.
         reach: Distance from the cameras up to which the ground is extended, in units of the aligned frame.
         tolerance: Largest distance of an inlier from the ground plane, in units of the aligned frame.
     """
 
-    points: int = 6000
+    points: int = 12_000
     spacing: float = 0.04
+    most_pixels: float = 12.0
     reach: float = 1.0
     tolerance: float = 0.03
 
