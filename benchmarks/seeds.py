@@ -22,8 +22,8 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, shift
 from torch import Tensor
 
+from detail_bound import held_out
 from wildgs.evaluation.metrics import detail
-from wildgs.scene.split import find_split_file, read_split
 
 BLOCK = 48
 """Side of a block that is moved, in pixels."""
@@ -35,14 +35,6 @@ FINE = 1.5
 """Standard deviation of the high-pass filter of `wildgs.evaluation.metrics.detail`."""
 
 Picture = Float[np.ndarray, "H W 3"]
-
-
-def held_out(scene: Path) -> list[str]:
-    """Names of the photos that the scene's split file holds out."""
-    split = find_split_file(scene)
-    if split is None:
-        raise SystemExit(f"{scene}: no split file")
-    return [name for name, part in read_split(split).items() if part == "test"]
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> Picture:
