@@ -120,7 +120,7 @@ def trainer_for(
 ) -> Trainer:
     torch.manual_seed(0)
     config = TrainConfig(
-        steps=60,
+        steps=40,
         precision="float32",
         density=DensityConfig(strategy=strategy),
         dropout=DropoutConfig(rate=0.5),

@@ -99,7 +99,7 @@ def test_what_is_in_front_of_the_sky_disappears(scene: Scene, model: WildGSConfi
     """The curtain has the colour of the sky, so that the photos do not tell them apart."""
     opacities = {}
     for weight in (0.0, 1.0):
-        trainer = trainer_for(scene, model, 60, weight, begins_with=with_curtain(scene))
+        trainer = trainer_for(scene, model, 50, weight, begins_with=with_curtain(scene))
         trainer.run()
         opacities[weight] = opacity_above(trainer)
     assert opacities[0.0] > 0.5
