@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter, shift
 from torch import Tensor
 
 from detail_bound import held_out
-from wildgs.evaluation.metrics import detail
+from wildgs.evaluation.metrics import DETAIL_SIGMA, detail
 
 BLOCK = 48
 """Side of a block that is moved, in pixels."""
@@ -31,8 +31,6 @@ SHIFTS = np.arange(-1.5, 1.51, 0.5)
 """Tried shifts along each axis, in pixels."""
 SCALES = (0.7, 1.5, 3.0, 6.0, 12.0, 24.0)
 """Standard deviations of the Gaussian filters that separate the scales, in pixels."""
-FINE = 1.5
-"""Standard deviation of the high-pass filter of `wildgs.evaluation.metrics.detail`."""
 
 Picture = Float[np.ndarray, "H W 3"]
 
@@ -67,7 +65,8 @@ def by_scale(error: Picture) -> Float[np.ndarray, " S"]:
 def aligned(render: Picture, truth: Picture) -> Picture:
     """The render with every block moved to where its high frequencies correlate best with the ground truth's."""
     fine, true = (
-        picture.mean(axis=2) - gaussian_filter(picture.mean(axis=2), FINE) for picture in (render, truth)
+        picture.mean(axis=2) - gaussian_filter(picture.mean(axis=2), DETAIL_SIGMA)
+        for picture in (render, truth)
     )
     moves = list(product(SHIFTS, SHIFTS))
     details = [shift(fine, move, order=3, mode="nearest") for move in moves]

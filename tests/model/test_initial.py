@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,9 +25,10 @@ from wildgs.model.initial import (
 from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import METHODS, method_type
 from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.priors.config import GroundConfig
 from wildgs.priors.ground import GroundPoints
 from wildgs.rasterize import blend
-from wildgs.scene import Alignment, Scene
+from wildgs.scene import Alignment, Scene, View, load_scene
 
 
 def grid(spacing: float) -> torch.Tensor:
@@ -69,6 +72,43 @@ def bare_scene(points: int) -> Scene:
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(points, 3, generator=generator)
     return Scene(Path("bare"), (), places, torch.zeros(points, 3, dtype=torch.uint8), Alignment.identity())
+
+
+def paved_scene(view: View) -> Scene:
+    """Paving at z = -0.5 with a gap, and cameras at a height of 0.05 above the gap that look along +y."""
+    generator = torch.Generator().manual_seed(0)
+    places = 4 * torch.rand(4000, 2, generator=generator) - 2
+    places = places[places.norm(dim=1) > 0.6]
+    points = torch.cat([places, torch.full((len(places), 1), -0.5)], dim=1)
+    turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    K, views = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]]), []
+    for number in range(3):
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = turn
+        viewmat[:3, 3] = -turn @ torch.tensor([0.2 * number, -0.3, -0.45])
+        views.append(replace(view, name=f"{number}.jpg", camera=Camera(viewmat, K, 100, 80)))
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    return Scene(Path("paved"), tuple(views), points, colors, Alignment.identity())
+
+
+def test_the_ground_is_where_sfm_has_it_and_denser_where_photos_are_near(
+    make_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Points of depth maps, of which there are more, lie 0.02 lower."""
+    scene = paved_scene(load_scene(make_scene(3)).train_views[0])
+    lower = scene.points.repeat(3, 1) - torch.tensor([0.0, 0.0, 0.02])
+    dense = lower, torch.zeros(len(lower), 3, dtype=torch.uint8)
+    monkeypatch.setattr("wildgs.model.initial.depth_points", lambda *_: dense)
+    config = InitialConfig(sky=SkyConfig(points=0))
+    initial = initial_gaussians(scene, config, 3_000_000)
+    ground = slice(len(scene.points) + len(lower), None)
+    heights, scales = initial.rows["means"][ground, 2], initial.rows["log_scales"][ground].exp()
+    torch.testing.assert_close(heights, torch.full_like(heights, -0.5), atol=1e-4, rtol=0)
+    torch.testing.assert_close(scales[:, 2], scales[:, 0] / 6, rtol=1e-4, atol=0)
+    assert float(scales[:, 0].max()) >= 4 * float(scales[:, 0].min())
+    even = initial_gaussians(scene, replace(config, ground=GroundConfig(most_pixels=0.0)), 3_000_000)
+    assert float(even.rows["log_scales"][ground, 0].std()) < 1e-5
+    assert len(even.colors) < len(initial.colors)
 
 
 @settings(deadline=None, max_examples=200)

@@ -92,20 +92,19 @@ def initial_gaussians(
     wanted_ground = replace(config.ground, points=budget.further(config.ground.points, taken))
     points, colors = (torch.cat(both) for both in zip(sparse, dense, strict=True))
     cameras = [view.camera for view in scene.train_views]
-    ground = ground_points(
-        points, colors, _ground(sparse[0], points, cameras, wanted_ground), cameras, wanted_ground
-    )
+    plane = _ground_below(cameras, sparse[0], points, wanted_ground)
+    ground = ground_points(points, colors, plane, cameras, wanted_ground)
     names = [view.name for view in scene.train_views]
     return initial_from_points(replace(config, sky=sky), *sparse, dense=dense, ground=ground, photos=names)
 
 
-def _ground(
+def _ground_below(
+    cameras: Sequence[Camera],
     sparse: Float[Tensor, "P 3"],
     surface: Float[Tensor, "Q 3"],
-    cameras: Sequence[Camera],
     config: GroundConfig,
 ) -> Float[Tensor, "3"] | None:
-    """The ground plane, as in `wildgs.engine.flat_ground`; None without one or if no ground is wanted."""
+    """The plane on which `wildgs.engine.flat_ground` keeps the ground; None if there is or should be none."""
     if not (cameras and config.points):
         return None
     centers = torch.stack([camera.position for camera in cameras])
