@@ -206,14 +206,15 @@ def _read_split(folder: Path) -> object:
 
 
 def _config(folder: Path) -> list[str]:
-    from wildgs.config import RunConfig, write_config
+    from wildgs.config import RunConfig
+    from wildgs.config_file import write_config
 
     write_config(folder / "config.yaml", RunConfig(Path("scene")))
     return ["config.yaml"]
 
 
 def _read_config(folder: Path) -> object:
-    from wildgs.config import read_config
+    from wildgs.config_file import read_config
 
     return read_config(folder / "config.yaml")
 

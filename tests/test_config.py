@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wildgs.config import RunConfig, differing_entries, from_plain, to_plain, validated, with_entries
+from wildgs.config import RunConfig, differing_entries, validated, with_entries
 from wildgs.errors import UserError
 from wildgs.model.config import VanillaConfig, VanillaRates, WildGSRates, WrappingConfig
+from wildgs.plain_values import from_plain, to_plain
 
 BASE = RunConfig(Path("scene"))
 

@@ -1,32 +1,22 @@
-"""The configuration of a run, composed of the packages' dataclasses, and its YAML file."""
+"""The configuration of a run, composed of the packages' dataclasses."""
 
 from __future__ import annotations
 
 import dataclasses
-import reprlib
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
-
-import yaml
-import yaml.composer
+from typing import Any, TypeVar
 
 from wildgs.earlier_defaults import with_earlier_defaults
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
-from wildgs.files import check_regular, written_aside
 from wildgs.model.registry import DEFAULT_METHOD, MethodName, config_type
+from wildgs.plain_values import entry_types, flat, from_plain, to_plain
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 
-CONFIG_FILE = "config.yaml"
-MAX_CONFIG_BYTES = 1_000_000
 BUDGET = "train.density.max_gaussians"  # the only entry that may change when a run is resumed
 
-_BEGIN, _END = "# Configuration of a run of wildgs", "# End of the configuration"
-"""First and last line, to detect truncation: a truncated file could still be valid YAML with entries missing."""
 _MAX_VALUE = 1e9
 _RANGES: dict[str, tuple[float, float]] = {
     "data.downscale": (1, 1000),
@@ -74,8 +64,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "model.sky.opacity": (1e-6, 0.999999),
 }
 """Smallest and largest value of numeric entries; those not listed range from 0 to `_MAX_VALUE`."""
-_MOVED = (("data", "image_cache"), ("train", "cuda_graphs"))
-"""Entries of earlier versions' `config.yaml` that are part of `ExecutionConfig` now."""
 
 
 @dataclass(frozen=True)
@@ -145,10 +133,19 @@ class RunConfig:
             raise TypeError(
                 f"method {self.method} takes a {kind.__name__}, not a {type(self.model).__name__}"
             )
-        for path, value in _flat(to_plain(self)).items():
+        for path, value in flat(to_plain(self)).items():
             least, most = _RANGES.get(path.replace("model.initial.", "model."), (0, _MAX_VALUE))
             if isinstance(value, int | float) and not least <= value <= most:  # also rejects NaN
                 raise UserError(f"{path} {value}: must be from {least:g} to {most:g}")
+
+    @classmethod
+    def upgraded(cls, plain: dict[Any, Any], where: str) -> tuple[dict[Any, Any], dict[str, Any]]:
+        """The current form of an earlier version's entries, and the type of the method's options."""
+        try:
+            kind = config_type(_method_of(plain))
+        except UserError as error:
+            raise UserError(f"{where}.{error}") from error
+        return _upgraded(plain, kind), {"model": kind}
 
     def with_method(self, method: MethodName) -> RunConfig:
         """The configuration with another method and that method's default options."""
@@ -158,17 +155,6 @@ class RunConfig:
 ConfigT = TypeVar("ConfigT")
 
 
-def to_plain(value: Any) -> Any:
-    """Converts a configuration to dicts, lists, strings and numbers."""
-    if type(value).__module__ == "numpy":  # np.float32(2), for example
-        return value.item()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, (tuple, list)):
-        return [to_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
 def validated(config: ConfigT) -> ConfigT:
     """A configuration from Python, with entries of the annotated types, as if it had been read from a file.
 
@@ -176,57 +162,6 @@ def validated(config: ConfigT) -> ConfigT:
         UserError: An entry has another type, for example a float where an integer is expected.
     """
     return from_plain(type(config), to_plain(config), type(config).__name__)
-
-
-def from_plain(kind: Any, value: Any, where: str = "config") -> Any:
-    """The inverse of `to_plain`; missing entries take their defaults.
-
-    Args:
-        kind: Type to convert to.
-        value: Plain value.
-        where: Path of the entry, for messages.
-
-    Raises:
-        UserError: An entry is unknown or has the wrong type.
-    """
-    if dataclasses.is_dataclass(kind):
-        return _dataclass_from_plain(kind, value, where)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal and value in arguments:
-        return value
-    if origin in (typing.Union, types.UnionType):
-        return _union_from_plain(arguments, value, where)
-    if origin is tuple and isinstance(value, list):
-        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
-        if len(inner) == len(value):
-            return tuple(from_plain(k, v, where) for k, v in zip(inner, value, strict=True))
-    if kind is Path and isinstance(value, str):
-        return Path(value)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(kind, type) and type(value) is kind and value == value:  # rejects NaN
-        return value
-    raise UserError(f"{where}: {reprlib.repr(value)} is not a {getattr(kind, '__name__', kind)}")
-
-
-def _dataclass_from_plain(kind: Any, value: Any, where: str) -> Any:
-    if not isinstance(value, dict):
-        raise UserError(f"{where}: expected a mapping, found {reprlib.repr(value)}")
-    hints = typing.get_type_hints(kind)
-    if kind is RunConfig:
-        try:
-            config_type(_method_of(value))
-        except UserError as error:
-            raise UserError(f"{where}.{error}") from error
-        value = _upgraded(value)
-        hints["model"] = config_type(_method_of(value))
-    known = {f.name for f in dataclasses.fields(kind)}
-    if unknown := sorted(map(str, set(value) - known)):
-        raise UserError(f"{where}: unknown entry {unknown[0][:80]!r}; choose from {', '.join(sorted(known))}")
-    required = {f.name for f in dataclasses.fields(kind) if _is_required(f)}
-    if missing := sorted(required - set(value)):
-        raise UserError(f"{where}: the entry {missing[0]!r} is missing")
-    return kind(**{name: from_plain(hints[name], entry, f"{where}.{name}") for name, entry in value.items()})
 
 
 def _method_of(plain: dict[Any, Any]) -> str:
@@ -239,17 +174,17 @@ _MOVED_RATES = {name: name for name in ("intrinsic", "networks", "encoder", "sh0
 """Entries of `train.optimizer` in earlier versions -> entries of `model.learning_rates` now."""
 
 
-def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
+def _upgraded(plain: dict[Any, Any], model_type: type) -> dict[Any, Any]:
     """Converts the configuration of an earlier version's run to the current form.
 
     Learning rates of a method's own parameters were entries of `train.optimizer`, every method had the default
     method's options, and `train.objective` repeated the mask threshold.
     """
     plain = with_earlier_defaults(plain)
-    known = _entries(config_type(_method_of(plain)))
+    known = entry_types(model_type)
     model = plain.get("model")
     if isinstance(model, dict):
-        foreign = _entries(config_type(DEFAULT_METHOD)).keys() - known.keys()
+        foreign = entry_types(config_type(DEFAULT_METHOD)).keys() - known.keys()
         plain = plain | {"model": {name: value for name, value in model.items() if name not in foreign}}
     train = plain.get("train")
     optimizer = train.get("optimizer") if isinstance(train, dict) else None
@@ -261,81 +196,9 @@ def _upgraded(plain: dict[Any, Any]) -> dict[Any, Any]:
     kept = {name: value for name, value in optimizer.items() if name not in moved}
     objective = {n: v for n, v in (train.get("objective") or {}).items() if n != "mask_threshold"}
     plain = plain | {"train": train | {"optimizer": kept, "objective": objective}}
-    own = _entries(known["learning_rates"]) if "learning_rates" in known else {}
+    own = entry_types(known["learning_rates"]) if "learning_rates" in known else {}
     rates = {_MOVED_RATES[name]: value for name, value in moved.items() if _MOVED_RATES[name] in own}
     return plain | {"model": (plain.get("model") or {}) | ({"learning_rates": rates} if rates else {})}
-
-
-def _entries(kind: Any) -> dict[str, Any]:
-    """Names and types of a dataclass's fields."""
-    hints = typing.get_type_hints(kind)
-    return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
-
-
-def _is_required(entry: dataclasses.Field[Any]) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING
-
-
-def _union_from_plain(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
-    if value is None and type(None) in kinds:
-        return None
-    for kind in kinds:
-        try:
-            return from_plain(kind, value, where)
-        except UserError:
-            continue
-    names = " or ".join("None" if k is type(None) else getattr(k, "__name__", str(k)) for k in kinds)
-    raise UserError(f"{where}: {reprlib.repr(value)} is not of type {names}")
-
-
-class _Loader(yaml.SafeLoader):
-    """Loads plain data and rejects aliases, with which a small file can expand beyond the memory."""
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
-            raise yaml.composer.ComposerError(None, None, "references are not allowed", event.start_mark)
-        return super().compose_node(parent, index)
-
-
-def write_config(path: Path, config: RunConfig) -> None:
-    """Writes YAML atomically.
-
-    Raises:
-        UserError: The file cannot be written.
-    """
-    with written_aside(path, flush=True) as aside, aside.open("w", encoding="utf-8") as file:
-        file.write(f"{_BEGIN}\n")
-        yaml.safe_dump(to_plain(config), file, sort_keys=False)
-        file.write(f"{_END}\n")
-
-
-def read_config(path: Path) -> RunConfig:
-    """Reads YAML.
-
-    Raises:
-        UserError: The file is missing, not YAML, or not the configuration of a run.
-    """
-    try:
-        check_regular(path)
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise UserError(
-                f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is not a run's configuration"
-            )
-        text = path.read_text(encoding="utf-8")
-        if text.startswith(_BEGIN) and _END not in text.splitlines():
-            raise UserError(f"{path} is truncated: the line {_END!r} is missing; restore it from a copy")
-        plain = yaml.load(text, _Loader)
-    except FileNotFoundError as error:
-        raise UserError(
-            f"{path.parent} contains no run: {path.name} is missing; give another folder, or train without --resume"
-        ) from error
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: an invalid date
-        raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
-    for part, name in _MOVED:
-        if isinstance(plain, dict) and isinstance(plain.get(part), dict):
-            plain[part].pop(name, None)
-    return from_plain(RunConfig, plain, str(path))
 
 
 def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "config") -> RunConfig:
@@ -368,7 +231,7 @@ def with_entries(config: RunConfig, entries: Mapping[str, Any], where: str = "co
 
 def differing_entries(first: RunConfig, second: RunConfig) -> dict[str, tuple[Any, Any]]:
     """Entries, other than `scene`, in which two configurations differ: path -> both plain values."""
-    one, other = _flat(to_plain(first)), _flat(to_plain(second))
+    one, other = flat(to_plain(first)), flat(to_plain(second))
     paths = dict.fromkeys(path for path in (*one, *other) if path != "scene")
     return {p: (one.get(p), other.get(p)) for p in paths if one.get(p) != other.get(p)}
 
@@ -382,14 +245,7 @@ def edited_entries(config: RunConfig, plain: Any) -> str:
         config: The current configuration, from `config.yaml`.
         plain: The plain configuration in the checkpoint's header.
     """
-    now, then = _flat(to_plain(config)), _flat(plain)
-    allowed = {"scene", "train.density.max_gaussians"}
+    now, then = flat(to_plain(config)), flat(plain)
+    allowed = {"scene", BUDGET}
     changed = [path for path in now if path in then and path not in allowed and now[path] != then[path]]
     return ", ".join(f"{path} was {then[path]}, is {now[path]}" for path in changed[:3])
-
-
-def _flat(plain: Any, path: str = "") -> dict[str, Any]:
-    if not isinstance(plain, dict):
-        return {path: plain}
-    parts = (_flat(value, f"{path}.{name}" if path else name) for name, value in plain.items())
-    return {key: value for part in parts for key, value in part.items()}

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
-from wildgs.config import RunConfig, to_plain, with_entries
+from wildgs.config import RunConfig, with_entries
 from wildgs.model.config import RESNET18
+from wildgs.plain_values import to_plain
 
 PresetName = Literal["default", "paper", "paper-mended", "fast"]
 PRESET_NAMES: tuple[PresetName, ...] = get_args(PresetName)

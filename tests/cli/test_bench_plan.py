@@ -8,7 +8,8 @@ from typing import get_args
 
 import pytest
 
-from wildgs.config import RunConfig, differing_entries, with_entries, write_config
+from wildgs.config import RunConfig, differing_entries, with_entries
+from wildgs.config_file import write_config
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.benchmark_table import PHOTOTOURISM, published_figures
 from wildgs.library.benchmark_plan import find_phototourism, label_of, make_jobs, method_config, parse_variant

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from wildgs.config import read_config
+from wildgs.config_file import read_config
 from wildgs.errors import WildGSWarning
 from wildgs.runs import load_run
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 import yaml
 
-from wildgs.config import RunConfig, read_config
+from wildgs.config import RunConfig
+from wildgs.config_file import read_config
 from wildgs.engine import autosave
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.engine.config import TrainConfig

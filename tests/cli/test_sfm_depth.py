@@ -6,7 +6,8 @@ from PIL import Image
 
 from wildgs.cli import depth, sfm
 from wildgs.cli import main as wildgs
-from wildgs.config import RunConfig, write_config
+from wildgs.config import RunConfig
+from wildgs.config_file import write_config
 from wildgs.library import pipeline
 from wildgs.priors.config import StereoConfig
 from wildgs.priors.depth import DepthEstimator

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import wildgs
-from wildgs.config import write_config
+from wildgs.config_file import write_config
 from wildgs.errors import UserError
 from wildgs.library.collection import changed_options, compare_collection, record_collection
 from wildgs.library.pipeline import CPU_LONG_SIDE, GPU_LONG_SIDE, _configure, _photo_size

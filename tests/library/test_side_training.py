@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from wildgs.config import ExecutionConfig, RunConfig, write_config
+from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.config_file import write_config
 from wildgs.engine.config import TrainConfig
 from wildgs.library.side_training import training_beside
 from wildgs.runs import load_run
@@ -60,7 +61,8 @@ import sys
 import time
 from pathlib import Path
 
-from wildgs.config import ExecutionConfig, read_config
+from wildgs.config import ExecutionConfig
+from wildgs.config_file import read_config
 from wildgs.library.side_training import training_beside
 
 config, folder = map(Path, sys.argv[1:])

@@ -16,8 +16,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from wildgs.config import RunConfig, from_plain
+from wildgs.config import RunConfig
 from wildgs.errors import UserError
+from wildgs.plain_values import from_plain
 from wildgs.scene.colmap import _checked_name
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"

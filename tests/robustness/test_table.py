@@ -19,7 +19,8 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from wildgs.config import RunConfig, write_config
+from wildgs.config import RunConfig
+from wildgs.config_file import write_config
 from wildgs.engine import checkpoint as checkpoint_module
 from wildgs.engine.checkpoint import load_checkpoint
 from wildgs.errors import UserError, WildGSWarning

@@ -12,7 +12,8 @@ import torch
 from PIL import Image
 
 import wildgs
-from wildgs.config import read_config, with_entries, write_config
+from wildgs.config import with_entries
+from wildgs.config_file import read_config, write_config
 from wildgs.engine.recorder import Recorder
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.library.day import known_day

@@ -13,7 +13,8 @@ import tyro
 
 from wildgs.cli.options import UNNAMED, option_name
 from wildgs.cli.screen import console, progress_shown
-from wildgs.config import BUDGET, CONFIG_FILE, ExecutionConfig, RunConfig, differing_entries, read_config
+from wildgs.config import BUDGET, ExecutionConfig, RunConfig, differing_entries
+from wildgs.config_file import CONFIG_FILE, read_config
 from wildgs.engine.config import TrainConfig
 from wildgs.errors import UserError
 from wildgs.model.registry import DEFAULT_METHOD, METHODS, MethodName, config_type

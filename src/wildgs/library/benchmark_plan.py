@@ -12,7 +12,8 @@ from typing import Any
 
 import yaml
 
-from wildgs.config import CONFIG_FILE, RunConfig, differing_entries, read_config, with_entries
+from wildgs.config import RunConfig, differing_entries, with_entries
+from wildgs.config_file import CONFIG_FILE, read_config
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.evaluation.benchmark_table import PHOTOTOURISM
 from wildgs.library.config import BENCH_METHODS, ENTRIES_WITHOUT, HALF, WITHOUT

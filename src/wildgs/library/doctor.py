@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from wildgs.config import CONFIG_FILE
+from wildgs.config_file import CONFIG_FILE
 from wildgs.files import check_regular
 from wildgs.library.logs import LOG_FILE
 

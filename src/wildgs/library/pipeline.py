@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from wildgs.config import CONFIG_FILE, ExecutionConfig, RunConfig, read_config, with_entries
+from wildgs.config import ExecutionConfig, RunConfig, with_entries
+from wildgs.config_file import CONFIG_FILE, read_config
 from wildgs.engine.config import DensityConfig, TrainConfig
 from wildgs.engine.report import Observer
 from wildgs.errors import UserError

@@ -27,7 +27,7 @@ def main(config: str, folder: str, threads: str) -> None:
     with limited(int(threads)):
         compile_kernels()
 
-        from wildgs.config import read_config
+        from wildgs.config_file import read_config
         from wildgs.library.training import train
 
         def stop_if_orphaned(report: StepReport) -> None:

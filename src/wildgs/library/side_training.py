@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from wildgs.config import ExecutionConfig, RunConfig, write_config
+from wildgs.config import ExecutionConfig, RunConfig
+from wildgs.config_file import write_config
 from wildgs.runs import default_device
 from wildgs.threads import kernels_limited, limited, thread_count
 

@@ -14,15 +14,8 @@ from typing import Literal
 import torch
 
 from wildgs import features
-from wildgs.config import (
-    BUDGET,
-    CONFIG_FILE,
-    ExecutionConfig,
-    RunConfig,
-    differing_entries,
-    read_config,
-    validated,
-)
+from wildgs.config import BUDGET, ExecutionConfig, RunConfig, differing_entries, validated
+from wildgs.config_file import CONFIG_FILE, read_config
 from wildgs.engine.autosave import Autosave, CheckpointWriter
 from wildgs.engine.memory import plan_budget
 from wildgs.engine.recorder import Recorder

@@ -14,7 +14,8 @@ import filelock
 import torch
 from torch import Tensor
 
-from wildgs.config import CONFIG_FILE, RunConfig, edited_entries, read_config, to_plain, write_config
+from wildgs.config import RunConfig, edited_entries
+from wildgs.config_file import CONFIG_FILE, read_config, write_config
 from wildgs.engine.checkpoint import Checkpoint, list_checkpoints, load_newest, save_checkpoint
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import Trainer
@@ -22,6 +23,7 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.files import is_there
 from wildgs.model.method import Method
 from wildgs.model.registry import create_method, restore_method
+from wildgs.plain_values import to_plain
 from wildgs.progress import Counter
 from wildgs.runs.scenes import CHECKPOINT_FOLDER, adopt_scene, carried_record, require_same_scene
 from wildgs.scene import Alignment, Scene, load_scene
