@@ -160,13 +160,19 @@ def test_only_an_appearance_is_replaced(method, look, tmp_path: Path) -> None:
 def test_a_sky_profile_is_saved(method, look, tmp_path: Path) -> None:
     """A file without one, of an earlier version, has none."""
     plain = replace(look.embeddings, sky_profile=None)
-    with_sky = replace(plain, sky_profile=torch.rand(3, 5))
+    with_sky = replace(plain, sky_profile=torch.rand(3, 9))
     for number, embeddings in enumerate((plain, with_sky)):
         file = save_look(replace(look, embeddings=embeddings), tmp_path / f"{number}.safetensors")
         found = load_look(method, file).embeddings.sky_profile
         expected = embeddings.sky_profile
         assert found is None if expected is None else torch.equal(found, expected)
     tensors, metadata = load_file(file), safe_open(file, "pt").metadata()
+    earlier = torch.rand(3, 5)
+    save_file(tensors | {"sky_profile": earlier}, file, metadata)
+    found = load_look(method, file).embeddings.sky_profile
+    assert found is not None
+    assert torch.equal(found[:, :5], earlier)
+    assert not found[:, 5:].any(), "a palette of one colour"
     save_file(tensors | {"sky_profile": torch.rand(3, 6)}, file, metadata)
     with pytest.raises(UserError, match="not an appearance file"):
         load_look(method, file)

@@ -31,24 +31,56 @@ def graded(directions: torch.Tensor) -> torch.Tensor:
     return torch.lerp(LOW, HIGH, (directions[:, 2:] / 0.5).clamp(0, 1))
 
 
-def painted(profile: torch.Tensor, directions: torch.Tensor, value: float = 0.1) -> torch.Tensor:
+def painted(
+    profile: torch.Tensor, directions: torch.Tensor, color: torch.Tensor | float = 0.1
+) -> torch.Tensor:
     """Colours of a sky that the networks painted in one colour."""
     harmonics = torch.zeros(len(directions), 4, 3)
-    harmonics[:, 0] = rgb_to_sh0(torch.full((len(directions), 3), value))
+    harmonics[:, 0] = rgb_to_sh0(torch.as_tensor(color).expand(len(directions), 3))
     return 0.5 + C0 * complete_sky(harmonics, profile, directions)[:, 0]
 
 
 @settings(deadline=None, max_examples=20)
-@given(azimuth=st.floats(-180, 180), people=st.floats(0, 0.25))
-def test_other_directions_take_the_colours_of_the_photo(azimuth: float, people: float) -> None:
+@given(azimuth=st.floats(-180, 180), people=st.floats(0, 0.04), many=st.floats(0.04, 0.25))
+def test_other_directions_take_the_colours_of_the_photo(azimuth: float, people: float, many: float) -> None:
+    """Few dark pixels in front of the sky do not matter; many of them do not change what is right already."""
     seen = directions_around(azimuth, 25)
-    colors = graded(seen)
-    colors[: round(people * len(colors))] = 0.0
-    profile = fit_sky_profile(colors, seen)
-    assert profile is not None
     behind = directions_around(azimuth + 180, 80)
     behind = behind[behind[:, 2] > 0.2]
-    torch.testing.assert_close(painted(profile, behind), graded(behind), atol=0.04, rtol=0)
+    for share, predicted in ((people, torch.tensor(0.1)), (many, graded(behind))):
+        colors = graded(seen)
+        colors[: round(share * len(colors))] = 0.0
+        profile = fit_sky_profile(colors, seen)
+        assert profile is not None
+        found = painted(profile, behind, predicted)
+        torch.testing.assert_close(found, graded(behind), atol=0.04, rtol=0)
+
+
+BLUE, CLOUD, PINK = (
+    torch.tensor([0.3, 0.5, 0.9]),
+    torch.tensor([0.9, 0.9, 0.95]),
+    torch.tensor([0.9, 0.6, 0.7]),
+)
+
+
+@settings(deadline=None, max_examples=20)
+@given(azimuth=st.floats(-180, 180), clouds=st.floats(0.15, 0.85), share=st.floats(0.1, 0.9))
+def test_a_cloudy_sky_may_be_blue_or_white_elsewhere(azimuth: float, clouds: float, share: float) -> None:
+    """What networks predict between the colours that the photo shows is kept, and no other hue."""
+    seen = directions_around(azimuth, 25)
+    cloudy = torch.rand(len(seen), generator=torch.Generator().manual_seed(1)) < clouds
+    profile = fit_sky_profile(torch.where(cloudy[:, None], CLOUD, BLUE), seen)
+    assert profile is not None
+    behind = directions_around(azimuth + 180, 60)
+    behind = behind[behind[:, 2] > 0.2]
+    between = torch.lerp(BLUE, CLOUD, share)
+    torch.testing.assert_close(
+        painted(profile, behind, between), between.expand(len(behind), 3), atol=0.08, rtol=0
+    )
+    line = functional.normalize(CLOUD - BLUE, dim=0)
+    found = painted(profile, behind, PINK) - BLUE
+    away = found - (found @ line)[:, None] * line
+    assert float(away.norm(dim=1).max()) < 0.05, "pink is moved onto the line from blue to white"
 
 
 def test_shown_directions_and_the_ground_stay_as_predicted() -> None:

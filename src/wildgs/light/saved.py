@@ -16,7 +16,7 @@ from wildgs.files import is_there, written_aside
 from wildgs.light.look import Look
 from wildgs.model.appearance import Embeddings
 from wildgs.model.method import Method
-from wildgs.model.sky_profile import COLUMNS
+from wildgs.model.sky_profile import COLUMNS, with_palette
 
 SUFFIX = ".safetensors"
 FORMAT = "wildgs-appearance-2"
@@ -128,6 +128,8 @@ def _fitting(method: Method, tensors: Mapping[str, Tensor]) -> Embeddings:
     if response is not None and response.shape != (method.response_size,):
         raise ValueError("a camera response of another length")
     sky_profile = tensors.get("sky_profile")
+    if sky_profile is not None:
+        sky_profile = with_palette(sky_profile)
     if sky_profile is not None and sky_profile.shape != (3, COLUMNS):
         raise ValueError("a sky profile of another shape")
     local = _local_embeddings(method, tensors) if method.local_size else None

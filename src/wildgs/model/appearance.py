@@ -30,7 +30,7 @@ class Appearance:
     color_map: Float[Tensor, "3 M"] | None = None
     basis_weights: Float[Tensor, " B"] | None = None
     response: Float[Tensor, " Q"] | None = None
-    sky_profile: Float[Tensor, "3 5"] | None = None
+    sky_profile: Float[Tensor, "3 9"] | None = None
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Embeddings:
     color_map: Float[Tensor, "3 M"] | None = None
     basis_weights: Float[Tensor, " B"] | None = None
     response: Float[Tensor, " Q"] | None = None
-    sky_profile: Float[Tensor, "3 5"] | None = None
+    sky_profile: Float[Tensor, "3 9"] | None = None
 
 
 def blend_embeddings(

@@ -136,7 +136,7 @@ class SkyConfig:
             Gaussians.
         own_fusion: Predict the colours of sky Gaussians by a fusion network of their own, because clouds and haze
             follow other rules than the light on surfaces.
-        complete: In directions that a photo does not show, take the colours of the sky from the part that it shows
+        complete: In directions that a photo does not show, admit only colours like those of the sky that it shows
             (`wildgs.model.sky_profile`).
     """
 

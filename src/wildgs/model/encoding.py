@@ -47,7 +47,7 @@ def corrected(model: WildGS, seen: SeenPhoto, appearance: Appearance) -> Appeara
     return replace(appearance, response=match.response(sight, rendering))
 
 
-def sky_profile(sight: Sight, picture: Picture, centre: Float[Tensor, " 3"]) -> Float[Tensor, "3 5"] | None:
+def sky_profile(sight: Sight, picture: Picture, centre: Float[Tensor, " 3"]) -> Float[Tensor, "3 9"] | None:
     """The sky profile of a photo; None for a scene or a photo without sky.
 
     Args:
@@ -67,7 +67,7 @@ def sky_profile(sight: Sight, picture: Picture, centre: Float[Tensor, " 3"]) -> 
 def with_sky_beyond(
     model: WildGS,
     harmonics: Float[Tensor, "V K 3"],
-    profile: Float[Tensor, "3 5"],
+    profile: Float[Tensor, "3 9"],
     means: Float[Tensor, "V 3"],
 ) -> Float[Tensor, "V K 3"]:
     """Harmonics of Gaussians whose sky is completed by a profile; unchanged for a scene without sky.

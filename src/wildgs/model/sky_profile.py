@@ -1,7 +1,8 @@
-"""The sky in directions that a photo does not show: colours by elevation, taken from the sky that it shows.
+"""The sky in directions that a photo does not show: colours like those of the sky that it shows.
 
 Not in the paper. What a network predicts for these directions comes from other photos, and the longer it is
-trained, the more of their skies it remembers: blue under a photo taken at dusk, pink beside a pale blue sky.
+trained, the more of their skies it remembers: blue under a photo taken at dusk, pink beside a pale blue sky. There,
+a colour may differ from the mean colour of its elevation only as the photo's own sky does, from cloud to blue.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.geometry.spherical_harmonics import rgb_to_sh0, sh_values
 
-COLUMNS = 5
-"""Columns of a sky profile."""
+COLUMNS, EARLIER_COLUMNS = 9, 5
+"""Columns of a sky profile, now and in earlier versions, which had no palette."""
 MARGIN, FADE = math.radians(15), math.radians(35)
 """Angle beyond the directions that the photo shows in which the network is trusted, and further angle until the
 profile counts fully. Beside a photo's frame the network is right more often."""
@@ -36,25 +37,29 @@ MOST_PIXELS = 20_000
 SHOWN = 0.05
 """Quantile of the cosines of sky pixels with their mean direction from which on directions count as shown; likewise
 of the elevations, at both ends."""
+RANGE = 0.05
+"""Quantile of the colours' deviations from the polynomial at both ends of the palette."""
 
 
 @torch.no_grad()
 def fit_sky_profile(
     colors: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
-) -> Float[Tensor, "3 5"] | None:
+) -> Float[Tensor, "3 9"] | None:
     """The colours of a photo's sky by elevation, and the directions in which it shows the sky.
 
     The colour is a quadratic polynomial of the sine of the elevation, fitted by robust least squares to pixels
-    above the horizon, and constant beyond the elevations that the photo shows.
+    above the horizon, and constant beyond the elevations that the photo shows. The palette is a line in the space
+    of colours: the direction in which the sky pixels deviate most from the polynomial, and by how much.
 
     Args:
         colors: Sky pixels, RGB in [0, 1].
         directions: Their directions from the scene's centre in the aligned frame, unit vectors.
 
     Returns:
-        ``[P | m | (cos r, s0, s1)]``: the coefficients of 1, s and s² for each channel; the mean direction; the
-        cosine of the angle r around it, and the sines of the elevations, that the photo shows. None if it shows too
-        little sky.
+        ``[P | m | (cos r, s0, s1) | d | R]``: the coefficients of 1, s and s² for each channel; the mean direction;
+        the cosine of the angle r around it, and the sines of the elevations, that the photo shows; the middle of
+        the palette relative to the polynomial; and the symmetric matrix whose eigenvalues are half of its length
+        along each eigenvector. None if the photo shows too little sky.
     """
     above = directions[:, 2] > HORIZON
     colors, directions = colors[above], directions[above]
@@ -67,7 +72,9 @@ def fit_sky_profile(
     limits = torch.stack(
         [(directions @ mean).quantile(SHOWN), sines.quantile(SHOWN), sines.quantile(1 - SHOWN)]
     )
-    return torch.cat([_polynomial(colors, sines), mean[:, None], limits[:, None]], dim=1)
+    polynomial = _polynomial(colors, sines)
+    middle, extent = _palette(colors - _powers(sines) @ polynomial.T)
+    return torch.cat([polynomial, mean[:, None], limits[:, None], middle[:, None], extent], dim=1)
 
 
 def _polynomial(colors: Float[Tensor, "P 3"], sines: Float[Tensor, "P"]) -> Float[Tensor, "3 3"]:
@@ -87,10 +94,31 @@ def _polynomial(colors: Float[Tensor, "P 3"], sines: Float[Tensor, "P"]) -> Floa
     return found.T.float()
 
 
+def _palette(deviations: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"]]:
+    """Middle and extent of the line on which most deviations lie.
+
+    A line, because a box around all deviations admits hues that the sky does not have: pink and slate grey between
+    the white and the blue of a hazy sky.
+    """
+    length = deviations.norm(dim=1)
+    usual = deviations[length <= length.quantile(1 - RANGE)]
+    axis = torch.linalg.eigh(usual.T @ usual).eigenvectors[:, -1]
+    along = deviations @ axis
+    low, high = along.quantile(RANGE), along.quantile(1 - RANGE)
+    return axis * (low + high) / 2, torch.outer(axis, axis) * (high - low) / 2
+
+
+def with_palette(profile: Float[Tensor, "_ _"]) -> Float[Tensor, "_ _"]:
+    """A profile in the current form; that of an earlier version gets a palette of one colour at each elevation."""
+    if profile.shape != (3, EARLIER_COLUMNS):
+        return profile
+    return functional.pad(profile, (0, COLUMNS - EARLIER_COLUMNS))
+
+
 def complete_sky(
-    harmonics: Float[Tensor, "S K 3"], profile: Float[Tensor, "3 5"], directions: Float[Tensor, "S 3"]
+    harmonics: Float[Tensor, "S K 3"], profile: Float[Tensor, "3 9"], directions: Float[Tensor, "S 3"]
 ) -> Float[Tensor, "S K 3"]:
-    """Replaces the colours of sky Gaussians in directions that a photo does not show by those of its profile.
+    """Replaces the colours of sky Gaussians in directions that a photo does not show by the nearest of its palette.
 
     Args:
         harmonics: Of the sky's Gaussians, relative to grey (0.5), as in `wildgs.rasterize.sh_to_colors`.
@@ -99,7 +127,11 @@ def complete_sky(
     """
     polynomial, mean, (cosine, lowest, highest) = profile[:, :3], profile[:, 3], profile[:, 4]
     sines = directions[:, 2]
-    colors = _powers(sines.clamp(lowest, highest)) @ polynomial.T
+    middle = _powers(sines.clamp(lowest, highest)) @ polynomial.T + profile[:, 5]
+    reach, axes = torch.linalg.eigh(profile[:, 6:])
+    reach = reach.clamp_min(0)
+    deviation = ((0.5 + sh_values(harmonics, directions) - middle) @ axes).clamp(-reach, reach)
+    colors = middle + deviation @ axes.T
     beyond = _angle(directions @ mean) - _angle(cosine) - MARGIN
     share = _smooth(beyond / FADE) * _smooth((sines - HORIZON) / (FREE - HORIZON))
     plain = torch.zeros_like(harmonics)
