@@ -55,6 +55,7 @@ _PAPER: dict[str, Any] = {
     "train.objective.depth_weight": 0.05,
     "train.objective.metric_weight": 0.0,
     "train.objective.sky_weight": 0.0,
+    "train.objective.opaque_weight": 0.0,
     "train.objective.mask_weight_photos": 0,
     "train.objective.mask_power": 1.0,
     "train.objective.consensus": False,

@@ -5,6 +5,7 @@ Recording needs CUDA; here `benchmarks/pretend_cuda` notes the loss's operations
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -63,7 +64,7 @@ def arguments(seed: int, height: int = 24, width: int = 30, **changes: Any) -> d
     } | changes
     photo = noise(height, width, 3)
     render = (0.8 * photo + 0.2 * noise(height, width, 3)).requires_grad_()
-    return {"config": CONFIG, "progress": 0.1 * seed, "photo": photo, "render": render, **options}
+    return {"config": CONFIG, "progress": 0.1 * seed, "photo": photo, "render": render} | options
 
 
 def values_and_gradients(function: Any, given: dict[str, Any]) -> list[Tensor]:
@@ -78,6 +79,7 @@ def values_and_gradients(function: Any, given: dict[str, Any]) -> list[Tensor]:
     [
         {},
         {"train_mask": False},
+        {"config": replace(CONFIG, opaque_weight=0.0)},
         {"visibility": None, "keep": None},
         {"disparity": None, "metric_depth": None, "sky": None},
         {"observations": None, "doubt": None},

@@ -22,6 +22,7 @@ from wildgs.model.parsing import ParsingConfig
 from wildgs.model.registry import create_method
 from wildgs.model.sky import SkyConfig
 from wildgs.model.wildgs import WildGS, WildGSConfig
+from wildgs.rasterize import blend
 from wildgs.scene import Alignment, Scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::wildgs.errors.WildGSWarning")
@@ -65,7 +66,12 @@ def with_curtain(scene: Scene) -> Scene:
 
 
 def trainer_for(
-    scene: Scene, model: WildGSConfig, steps: int, weight: float = 1.0, begins_with: Scene | None = None
+    scene: Scene,
+    model: WildGSConfig,
+    steps: int,
+    weight: float = 1.0,
+    begins_with: Scene | None = None,
+    opaque_weight: float = 0.0,
 ) -> Trainer:
     torch.manual_seed(0)
     method = create_method("wildgs", model, begins_with or scene)
@@ -75,7 +81,7 @@ def trainer_for(
     config = TrainConfig(
         steps=steps,
         precision="float32",
-        objective=ObjectiveConfig(sky_weight=weight),
+        objective=ObjectiveConfig(sky_weight=weight, opaque_weight=opaque_weight),
         density=DensityConfig(min_visibility=0.0),
     )
     return Trainer(method, scene, config)
@@ -104,6 +110,31 @@ def test_what_is_in_front_of_the_sky_disappears(scene: Scene, model: WildGSConfi
         opacities[weight] = opacity_above(trainer)
     assert opacities[0.0] > 0.5
     assert opacities[1.0] < 0.5 * opacities[0.0]
+
+
+@pytest.mark.parametrize(("points", "changes"), [(300, True), (0, False)], ids=["sky", "no sky"])
+def test_dark_walls_are_opaque(scene: Scene, model: WildGSConfig, points: int, changes: bool) -> None:
+    """What is dark would else be transparent before the black background; without sky, nothing need be behind."""
+    dark = []
+    for view in scene.views:
+        photo = torch.full((HEIGHT, WIDTH, 3), 204, dtype=torch.uint8)
+        photo[HEIGHT // 2 :] = 5
+        dark.append(make_view(view.name, view.camera, photo=photo))
+    scene = replace(scene, views=tuple(dark), point_colors=torch.full_like(scene.point_colors, 20))
+    model = replace(model, sky=replace(model.sky, points=points))
+    clear = []
+    for weight in (0.0, 0.3):
+        trainer = trainer_for(scene, model, 40, opaque_weight=weight)
+        with torch.no_grad():
+            trainer.method.gaussians.rows["opacity_logits"].fill_(-3.0)
+        trainer.run()
+        with torch.no_grad():
+            projection = trainer.method.gaussians.project(trainer.views[0].camera)
+            clear.append(float((1 - blend(projection, None).alpha).mean()))
+    if changes:
+        assert clear[1] < 0.7 * clear[0]
+    else:
+        assert clear[1] == clear[0] > 0
 
 
 @pytest.mark.parametrize(("points", "weight", "found"), [(300, 1.0, 4), (300, 0.0, 0), (0, 1.0, 0)], ids=str)

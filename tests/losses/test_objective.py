@@ -56,18 +56,19 @@ def test_the_number_of_photos_decides_the_weight_in_the_total(inputs):
 
 
 def test_total_is_the_weighted_sum_of_its_terms(inputs):
-    config = ObjectiveConfig(depth_weight=0.3)
+    config = ObjectiveConfig(depth_weight=0.3, opaque_weight=0.02)
     losses = total_loss(config, 0.5, **inputs)
     selection = (inputs["visibility"] > 0.5) & (inputs["alpha"] > 0.5)
     image = masked_photometric(inputs["photo"], inputs["render"], inputs["visibility"], 0.8, power=3.0)
     mask = visibility_regularizer(inputs["visibility"])
     depth = depth_correlation(inputs["depth"], inputs["disparity"], selection)
+    clear = (1 - inputs["alpha"]).mean()
     assert losses.as_floats() == pytest.approx(
         {
             "image": image.item(),
             "mask": mask.item(),
             "depth": depth.item(),
-            "total": (image + 0.25 * mask + 0.3 * depth).item(),
+            "total": (image + 0.25 * mask + 0.3 * depth + 0.02 * clear).item(),
         }
     )
 
@@ -189,3 +190,19 @@ def test_pixels_that_the_user_masks_are_no_sky() -> None:
         for each in (None, keep, torch.zeros_like(keep))
     ]
     assert [each.total.item() for each in losses] == pytest.approx([1.5, 1.125, 0.0])
+
+
+def test_what_is_transparent_is_penalised_but_where_the_user_masks() -> None:
+    photo = torch.zeros(16, 16, 3)
+    alpha = torch.full((16, 16), 0.75, requires_grad=True)
+    keep = torch.ones(16, 16, dtype=torch.bool)
+    keep[:, :4] = False
+    config = ObjectiveConfig(opaque_weight=2.0)
+    for mask, wanted in ((None, 0.5), (keep, 0.375), (torch.zeros_like(keep), 0.0)):
+        losses = total_loss(config, 0.0, photo, photo, alpha=alpha, keep=mask)
+        assert losses.total.item() == pytest.approx(wanted)
+    total_loss(config, 0.0, photo, photo, alpha=alpha, keep=keep).total.backward()
+    assert alpha.grad is not None
+    assert alpha.grad[:, 4:].unique().tolist() == [pytest.approx(-2.0 / 256)]
+    assert not alpha.grad[:, :4].any()
+    assert total_loss(ObjectiveConfig(opaque_weight=0.0), 0.0, photo, photo, alpha=alpha).total.item() == 0

@@ -165,7 +165,7 @@ def _as_tensors(
     visibility, observations = inputs.get("visibility"), options.get("observations")
     if visibility is not None and not options.get("train_mask", True):
         inputs["visibility"] = visibility.detach()
-    if "alpha" in inputs:
+    if "alpha" in inputs and not config.opaque_weight:
         inputs["alpha"] = inputs["alpha"].detach()  # selects pixels only
     if all(inputs.get(name) is None for name in ("disparity", "metric_depth", "sky")):
         inputs["depth"] = None  # otherwise its gradient would be zero instead of none

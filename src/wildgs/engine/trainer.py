@@ -104,6 +104,9 @@ class Trainer:
             self.views, self.sampler, self.team, self.device, observed_pixels(scene), scene.points
         )
         objective = config.objective
+        if not method.sky_depth:  # nothing need be behind the scene
+            objective = replace(objective, opaque_weight=0.0)
+        self._objective = objective
         evident = objective.consensus and objective.mask_gradient == "evidence"
         self.consensus = Consensus(self.device, len(self.views), self.schedule.mask_steps if evident else 0)
         self.flat_ground = FlatGround(method, scene, config.flat_ground)
@@ -269,7 +272,7 @@ class Trainer:
         output = self.method.training_pass(photo, self.feed.camera(view), stage, keep, name=view.name)
         supervised = self.method.depth_supervised and stage.explicit
         losses = self.loss(
-            self.config.objective,
+            self._objective,
             self.schedule.mask_progress(self.step),
             photo,
             output.picture,

@@ -23,6 +23,9 @@ class ObjectiveConfig:
         depth_weight: λ^D (paper: 0.05).
         metric_weight: Weight of the loss against metric depth, for scenes that have it. Not in the paper.
         sky_weight: Weight of the loss on Gaussians in front of the sky. Not in the paper.
+        opaque_weight: Weight of the mean of 1 - alpha in scenes with sky Gaussians, where every pixel shows
+            something. Otherwise, Gaussians that are transparent before the black background represent what is dark.
+            Not in the paper.
         mask_gradient: Gradient of the image loss to the mask. 'loss': the derivative of the paper's formula;
             'evidence': a robust measure of how transient a pixel is
             (`wildgs.losses.evidence.transient_evidence`). Neither changes the loss nor its gradient to the
@@ -40,6 +43,7 @@ class ObjectiveConfig:
     depth_weight: float = 0.01
     metric_weight: float = 0.1
     sky_weight: float = 1.0
+    opaque_weight: float = 0.03
     mask_gradient: Literal["evidence", "loss"] = "evidence"
     consensus: bool = True
     min_alpha: float = 0.5

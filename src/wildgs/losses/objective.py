@@ -22,8 +22,8 @@ class Losses:
         image: L^I.
         mask: L^M; 0 without a mask.
         depth: L^D plus the error against metric depth; 0 without depth maps.
-        total: ``L^I + λ^M L^M + λ^D L^D`` plus the weighted error against metric depth and the loss in front of the
-            sky.
+        total: ``L^I + λ^M L^M + λ^D L^D`` plus the weighted error against metric depth, the loss in front of the
+            sky and the mean transparency.
     """
 
     NAMES: ClassVar[tuple[str, ...]] = ("image", "mask", "depth", "total")
@@ -77,7 +77,8 @@ def total_loss(
         visibility: Predicted mask M; None for a method without a mask.
         keep: The user's mask: False = ignore the pixel in all terms.
         depth: Rendered expected depth.
-        alpha: Accumulated alpha of the render; the depth loss ignores pixels below `min_alpha`.
+        alpha: Accumulated alpha of the render, for the loss of transparency; the depth loss ignores pixels below
+            `min_alpha`.
         disparity: Monocular estimate, 0 where missing; None for a photo without it.
         metric_depth: Depth in world units, 0 where missing; used instead of the monocular estimate where it exists.
         sky: Pixels that certainly show sky; those that the user's mask leaves out are ignored.
@@ -169,6 +170,8 @@ def weighted_losses(
     if depth is not None and sky is not None:
         free = sky if keep is None else sky & keep
         total = total + config.sky_weight * nearness(depth, free, sky_depth)
+    if alpha is not None and config.opaque_weight:
+        total = total + config.opaque_weight * transparency(alpha, keep)
     return Losses(image=image, mask=mask, depth=depth_term, total=total)
 
 
@@ -206,6 +209,20 @@ def visibility_regularizer(visibility: Float[Tensor, "H W"]) -> Float[Tensor, ""
         0 where all is visible, 1 where all is hidden.
     """
     return (1 - visibility).square().mean()
+
+
+def transparency(alpha: Float[Tensor, "H W"], keep: Bool[Tensor, "H W"] | None) -> Float[Tensor, ""]:
+    """Mean of ``1 - alpha`` over all pixels, without those that the user's mask leaves out.
+
+    Args:
+        alpha: Accumulated alpha.
+        keep: The user's mask; gets no gradient.
+
+    Returns:
+        0 where nothing is transparent, 1 where nothing is rendered.
+    """
+    clear = 1 - alpha
+    return (clear if keep is None else torch.where(keep, clear, 0.0)).mean()
 
 
 def nearness(
