@@ -138,6 +138,24 @@ def test_a_run_in_use_is_locked(undisturbed: Path, landmark: Path, tmp_path: Pat
     assert load_run(undisturbed).step == 24, "reading is always allowed"
 
 
+def test_a_failure_before_anything_is_written_leaves_no_folder(tmp_path: Path) -> None:
+    new, existing, used = tmp_path / "new", tmp_path / "existing", tmp_path / "used"
+    existing.mkdir()
+
+    def fail(folder: Path) -> None:
+        with lock_run(folder):
+            if folder == used:
+                (folder / "config.yaml").touch()
+            raise UserError("no photos")
+
+    for folder in (new, existing, used):
+        with pytest.raises(UserError):
+            fail(folder)
+    assert not new.exists()
+    assert list(existing.iterdir()) == []
+    assert (used / "config.yaml").exists()
+
+
 def test_a_disk_without_locks_is_said_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise NotImplementedError("no flock")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -184,9 +184,12 @@ def holding(lock_file: Path) -> Iterator[bool | None]:
 def lock_run(folder: Path) -> Iterator[None]:
     """Locks a run folder against other processes for the duration of the block.
 
+    If the block wrote nothing, the folder is afterwards as it was before, or gone if it is new.
+
     Raises:
         UserError: Another process uses the folder, or it cannot be written to.
     """
+    is_new = not folder.exists()
     with holding(folder / LOCK_FILE) as held:
         if held is None:
             message = f"{folder} is on a file system without locks: do not start a second training in it"
@@ -195,7 +198,14 @@ def lock_run(folder: Path) -> Iterator[None]:
             raise UserError(
                 f"{folder} is in use by another training; wait for it or stop it, or choose another --output"
             )
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                if [file.name for file in folder.iterdir()] == [LOCK_FILE]:
+                    (folder / LOCK_FILE).unlink()
+                    if is_new:
+                        folder.rmdir()
 
 
 def newest_checkpoint(folder: Path, *, set_aside: bool = False) -> Checkpoint | None:
