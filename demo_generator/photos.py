@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Bool, Float, UInt8, UInt16
 from PIL import Image
 
-from demo_generator.camera_response import develop, draw_response, metered_gain
+from demo_generator.camera_response import CameraResponse, develop, draw_response, metered_gain
 from demo_generator.cameras import Viewpoint, draw_viewpoint
 from demo_generator.clocks import add_clock
 from demo_generator.landmark import add_landmark
@@ -102,6 +102,60 @@ def find_lights(config: SyntheticConfig) -> dict[str, Light]:
     return {f"landmark_{i:02d}.jpg": _begin_photo(i, place, config)[1] for i in range(config.photos)}
 
 
+def find_split(config: SyntheticConfig) -> dict[str, list[int]]:
+    """Numbers of the 'train' and of the 'test' photos."""
+    split: dict[str, list[int]] = {"train": [], "test": []}
+    for index in range(config.photos):
+        split[_split(index, config)].append(index)
+    return split
+
+
+def relit_photo(
+    view: int, light: int, config: SyntheticConfig
+) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
+    """The photo of the place without visitors from one photo's viewpoint, in the light and exposure of another one.
+
+    Args:
+        view: Number of the photo whose viewpoint is taken.
+        light: Number of the photo whose light, exposure and camera response are taken.
+        config: The scene's configuration.
+
+    Returns:
+        The photo, and where it does not show the sky.
+    """
+    place = build_place()
+    camera = _begin_photo(view, place, config)[0]
+    source = _meet(light, place, config)
+    gain = metered_gain(_shoot(place, source.visitors, source.light, source.view, config, light).radiance)
+    shot = _shoot(place, Solids().build(), source.light, camera, config, view)
+    return develop(shot.radiance, gain, source.response, seed=view), shot.depth > 0.0
+
+
+@dataclass(frozen=True)
+class _Encounter:
+    """What a photo is taken of, and with.
+
+    Attributes:
+        view: The viewpoint.
+        light: The light.
+        visitors: The visitors.
+        response: The camera's response.
+        rng: Randomness that is left to the photo.
+    """
+
+    view: Viewpoint
+    light: Light
+    visitors: World
+    response: CameraResponse
+    rng: np.random.Generator
+
+
+def _meet(index: int, place: Place, config: SyntheticConfig) -> _Encounter:
+    view, light, rng = _begin_photo(index, place, config)
+    visitors = draw_visitors(view, lambda x, y, radius: is_free(place.whole, x, y, radius), rng)
+    return _Encounter(view, light, visitors, draw_response(rng, dark=light.lamps > 0.0), rng)
+
+
 def _begin_photo(
     index: int, place: Place, config: SyntheticConfig
 ) -> tuple[Viewpoint, Light, np.random.Generator]:
@@ -141,14 +195,13 @@ def _choose_view(index: int, place: Place, config: SyntheticConfig, rng: np.rand
 
 def _take_photo(index: int, place: Place, config: SyntheticConfig, output: Path) -> Photo:
     """Renders and writes one photo with its depth prior, mask and (for a test photo) clean truth."""
-    view, light, rng = _begin_photo(index, place, config)
-    visitors = draw_visitors(view, lambda x, y, radius: is_free(place.whole, x, y, radius), rng)
-    response = draw_response(rng, dark=light.lamps > 0.0)
+    met = _meet(index, place, config)
+    view, light, response, rng = met.view, met.light, met.response, met.rng
 
     def shoot(people: World) -> Rendered:
         return _shoot(place, people, light, view, config, index)
 
-    shot = shoot(visitors)
+    shot = shoot(met.visitors)
     gain = metered_gain(shot.radiance)
     pixels = develop(shot.radiance, gain, response, seed=index)
     name = f"landmark_{index:02d}"

@@ -15,7 +15,7 @@ from demo_generator import SyntheticConfig, make_landmark
 from demo_generator.archive import pack, share_of_differences
 from demo_generator.cameras import Viewpoint
 from demo_generator.landmark import add_landmark
-from demo_generator.photos import disparity_prior
+from demo_generator.photos import disparity_prior, find_split, relit_photo
 from demo_generator.render_kernels import depth_and_kind
 from demo_generator.solids import Solids
 from demo_generator.surroundings import add_surroundings
@@ -159,3 +159,16 @@ def test_disparity_prior_is_largest_where_depth_is_least_and_zero_in_the_sky() -
 def test_senseless_configs_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="two photos or more"):
         SyntheticConfig(**wrong)
+
+
+def test_a_photo_can_be_rendered_in_the_light_of_another(tmp_path: Path) -> None:
+    """In its own light it is the clean truth of the photo, in that of another the place is the same."""
+    config = SyntheticConfig(photos=4, test_every=2, long_side=32, points=50)
+    make_landmark(tmp_path, config)
+    first, second = find_split(config)["test"]
+    own, place = relit_photo(first, first, config)
+    assert np.array_equal(own, _pixels(tmp_path / "truth" / "clean" / f"landmark_{first:02d}.png"))
+    relit, same_place = relit_photo(first, second, config)
+    assert np.array_equal(place, same_place)
+    assert relit.shape == own.shape
+    assert np.abs(relit.astype(int) - own).mean() > 3

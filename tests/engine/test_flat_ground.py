@@ -207,7 +207,7 @@ def test_it_can_be_switched_off(paving: Scene, tiny_model: WildGSConfig) -> None
     assert not FlatGround(method_for(paving, tiny_model), paving, replace(CONFIG, rate=0.0)).is_used
 
 
-def trainer_for(scene: Scene, model: WildGSConfig, rate: float = 0.05, steps: int = 40) -> Trainer:
+def trainer_for(scene: Scene, model: WildGSConfig, rate: float = 0.05, steps: int = 24) -> Trainer:
     config = TrainConfig(
         steps=steps,
         precision="float32",
@@ -224,8 +224,8 @@ def test_training_counts_photos_for_it_and_a_resumed_run_ends_in_the_same_bits(
     whole = trainer_for(paving, tiny_model)
 
     def save(report: StepReport) -> None:
-        if report.step == 25:
-            save_checkpoint(tmp_path, 25, whole.state(), {})
+        if report.step == 15:
+            save_checkpoint(tmp_path, 15, whole.state(), {})
 
     whole.run([save])
     assert whole.photo_counts.dropout_rates() is None

@@ -120,7 +120,7 @@ def trainer_for(
 ) -> Trainer:
     torch.manual_seed(0)
     config = TrainConfig(
-        steps=40,
+        steps=20,
         precision="float32",
         density=DensityConfig(strategy=strategy),
         dropout=DropoutConfig(rate=0.5),
@@ -148,7 +148,7 @@ def test_counts_follow_the_gaussians_and_a_resumed_run_ends_in_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
     strategy: Strategy,
 ) -> None:
-    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 20)
+    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 10)
     whole = trainer_for(wall_scene, tiny_model, strategy)
 
     edited = 0
@@ -156,12 +156,12 @@ def test_counts_follow_the_gaussians_and_a_resumed_run_ends_in_the_same_bits(
     def save(report: StepReport) -> None:
         nonlocal edited
         photos = whole.method.gaussians.photos
-        assert (photos is None) == (report.step <= 20)
+        assert (photos is None) == (report.step <= 10)
         assert photos is None or len(photos) == report.num_gaussians
         if report.density is not None:
             edited += report.density.cloned + report.density.split + report.density.pruned
-        if report.step == 30:
-            save_checkpoint(tmp_path, 30, whole.state(), {})
+        if report.step == 15:
+            save_checkpoint(tmp_path, 15, whole.state(), {})
 
     whole.run([save])
     assert edited, "no round of densification"
@@ -171,7 +171,7 @@ def test_counts_follow_the_gaussians_and_a_resumed_run_ends_in_the_same_bits(
 def test_plain_3dgs_drops_nothing(
     wall_scene: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 20)
+    monkeypatch.setattr(photo_counts, "LEAST_INTERVAL", 10)
     trainer = trainer_for(wall_scene, tiny_model, method="3dgs")
     trainer.run()
     assert trainer.method.gaussians.photos is None
