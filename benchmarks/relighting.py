@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Bool, Float
 from PIL import Image
 
 import wildgs
 from demo_generator.photos import SyntheticConfig, find_split, make_landmark, relit_photo
+from wildgs.evaluation.metrics import psnr
 
 FOLDER = "truth/relit"
 
@@ -92,27 +92,17 @@ def score(run: Path, scene: Path, config: SyntheticConfig) -> str:
     for view, light in pairs(config):
         source = f"landmark_{light:02d}.jpg"
         look = session.appearance(source)
-        picture = _floats(session.render(cameras[f"landmark_{view:02d}.jpg"].camera, look))
+        picture = session.render(cameras[f"landmark_{view:02d}.jpg"].camera, look)
         size = picture.shape[1], picture.shape[0]
-        with Image.open(scene / FOLDER / f"{view:02d}_under_{light:02d}.png") as truth:
-            error = (picture - np.asarray(truth.resize(size, Image.Resampling.LANCZOS)) / 255) ** 2
-        with Image.open(scene / FOLDER / f"{view:02d}_place.png") as mask:
-            solid: Bool[np.ndarray, "H W"] = np.asarray(mask.resize(size, Image.Resampling.BOX)) > 127
-        whole.append(_psnr(error))
-        place.append(_psnr(error[solid]))
-        photo = cameras[source].read_photo().numpy() / 255
-        own.append(_psnr((_floats(session.render(cameras[source].camera, look)) - photo) ** 2))
+        with Image.open(scene / FOLDER / f"{view:02d}_under_{light:02d}.png") as file:
+            truth = torch.from_numpy(np.array(file.resize(size, Image.Resampling.LANCZOS)))
+        with Image.open(scene / FOLDER / f"{view:02d}_place.png") as file:
+            solid = torch.from_numpy(np.array(file.resize(size, Image.Resampling.BOX)) > 127)
+        whole.append(psnr(picture, truth))
+        place.append(psnr(picture, truth, solid))
+        own.append(psnr(session.render(cameras[source].camera, look), cameras[source].read_photo()))
     means = [float(np.mean(values)) for values in (whole, place, own)]
     return "relit {:.2f} dB, without the sky {:.2f}; training photos {:.2f}".format(*means)
-
-
-def _floats(picture: torch.Tensor) -> Float[np.ndarray, "H W 3"]:
-    values = picture.float().numpy()
-    return (values / 255 if picture.dtype == torch.uint8 else values).clip(0, 1)
-
-
-def _psnr(squared_error: Float[np.ndarray, "..."]) -> float:
-    return float(-10 * np.log10(squared_error.mean()))
 
 
 if __name__ == "__main__":
