@@ -65,6 +65,7 @@ def test_both_hold_the_same_bits_after_densification(ranks: Path, method: str) -
     assert first["counts"] == second["counts"]
     assert len(set(first["counts"])) > 1
     assert first["losses"] == second["losses"]
+    assert first["displaced"] == [method == "wildgs"] * 7
     # One colour for two lights: what the baseline can gain in so few steps is little.
     falls = {"3dgs": 1.0, "wildgs": 0.8}[method]
     assert sum(first["losses"][-7:]) < falls * sum(first["losses"][:7])
@@ -100,6 +101,7 @@ def test_ranks_agree(ranks: Path) -> None:
     for heard in left(ranks, "heard"):
         assert heard["from_first"] == "by 0"
         assert heard["least"] == 4
+        assert heard["exchange"] == [(7, 0.0), (8, 0.5)]
         assert heard["stop"] == (0, 15)
         here, nowhere = heard["partly_without_gradient"]
         assert here.tolist() == [2, 1]

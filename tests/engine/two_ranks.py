@@ -101,6 +101,7 @@ def training(output: Path, team: Team) -> None:
         found = {
             "fingerprint": Checkpoint(state, {}).fingerprint,
             "photos": [report.view.name for report in reports],
+            "displaced": [bool(grid.any()) for grid in trainer.warps.grids],
             "counts": [report.num_gaussians for report in reports],
             "steps": [report.step for report in reports],
             "losses": [float(report.losses.total) for report in reports],
@@ -161,6 +162,8 @@ def mistakes(output: Path, team: Team) -> None:
     listen("unlike_facts", lambda: team.require_same({"photos": f"{8 + team.rank}"}))
     listen("unlike_sizes", unlike_sizes)
     listen("partly_without_gradient", partly_without_gradient)
+    own = torch.tensor([team.rank / 2])
+    listen("exchange", lambda: [(n, float(x)) for n, x in team.exchange(7 + team.rank, own)])
     listen("stop", stop)
     torch.save(heard, output / f"heard_{team.rank}.pt")
 

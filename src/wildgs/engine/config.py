@@ -157,6 +157,24 @@ class FlatGroundConfig:
 
 
 @dataclass(frozen=True)
+class WarpConfig:
+    """Training photos are displaced to where they fit renders (`wildgs.engine.photo_warps`). Not in the paper.
+
+    Attributes:
+        rate: Fraction of an estimated displacement that is applied. 0 = off.
+        friction: Pixels, of a photo whose longer side is reduced to at most 480, by which displacements decrease
+            each time that the photo is used.
+        cells: Number of cells along each side of a photo that are displaced independently.
+        most: Largest displacement along each axis, relative to the photo's longer side.
+    """
+
+    rate: float = 0.5
+    friction: float = 0.05
+    cells: int = 12
+    most: float = 0.01
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Training.
 
@@ -171,6 +189,7 @@ class TrainConfig:
         density: Densification and pruning.
         dropout: Dropout of Gaussians, for scenes of few photos.
         flat_ground: Ground that few photos show is kept flat.
+        warp: Training photos are displaced to where they fit their renders.
     """
 
     steps: int = 30_000
@@ -182,6 +201,7 @@ class TrainConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     dropout: DropoutConfig = field(default_factory=DropoutConfig)
     flat_ground: FlatGroundConfig = field(default_factory=FlatGroundConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
 
     def __post_init__(self) -> None:
         """Validates the number of steps."""

@@ -200,6 +200,14 @@ class Ranks(Team):
             dist.all_reduce(largest, op=dist.ReduceOp.MAX)
         return ViewStatistics(demand=sums[0], seen=sums[1], largest=largest)
 
+    def exchange(self, label: int, value: Tensor) -> list[tuple[int, Tensor]]:  # noqa: D102 - as in Team
+        labels = [torch.zeros(1, dtype=torch.int64) for _ in range(self.size)]
+        values = [torch.empty_like(value) for _ in range(self.size)]
+        with _peers():
+            dist.all_gather(labels, torch.tensor([label]), group=self._control)
+            dist.all_gather(values, value.contiguous())
+        return [(int(each), found) for each, found in zip(labels, values, strict=True)]
+
     def _gather(self, value: Any) -> list[Any]:
         gathered: list[Any] = [None] * self.size
         with _peers():

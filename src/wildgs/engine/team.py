@@ -98,6 +98,14 @@ class Team:
         """
         return statistics
 
+    def exchange(self, label: int, value: Tensor) -> list[tuple[int, Tensor]]:
+        """The labels and values of all ranks, in order of the ranks; values have the same shape and type.
+
+        Raises:
+            LostRankError: A rank ended or does not answer.
+        """
+        return [(label, value)]
+
 
 def same_everywhere(
     method: Method, views: Sequence[View], config: object, precision: torch.dtype

@@ -21,6 +21,7 @@ from wildgs.engine.flat_ground import FlatGround
 from wildgs.engine.loss_replay import LossReplays
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.photo_counts import PhotoCounts
+from wildgs.engine.photo_warps import PhotoWarps
 from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.report import Observer, StepReport
 from wildgs.engine.safety import StepGuard
@@ -51,6 +52,7 @@ class Trainer:
     Attributes:
         consensus: What may be transient in the training photos, as far as they have been compared.
         photo_counts: How many photos show each Gaussian, and hence how often it is dropped.
+        warps: Displacements of the training photos.
         on_compared_photo: Called with (photos done, total number of photos) when the photos are compared.
         on_final_photo: Called with (photos done, total number of photos) during `Method.finish` after the last
             step.
@@ -111,6 +113,8 @@ class Trainer:
         self.consensus = Consensus(self.device, len(self.views), self.schedule.mask_steps if evident else 0)
         self.flat_ground = FlatGround(method, scene, config.flat_ground)
         self.photo_counts = PhotoCounts(method, config.dropout, config.steps, needed=self.flat_ground.is_used)
+        begin = self.schedule.first_stage
+        self.warps = PhotoWarps(self.views, config.warp, begin, self.device, used=method.warps_photos)
         self.guard = StepGuard()
         self.loss = LossReplays()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
@@ -173,13 +177,15 @@ class Trainer:
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
+        target = self.warps.warped(view, photo, self.step)
         sky = self._sky(view)
-        output, losses = self._forward(view, photo, keep, sky)
+        output, losses = self._forward(view, photo, keep, sky, target)
+        self.warps.update(view, target, output.picture.detach(), self.step, self.team)
         seen = None
         if self.schedule.gathers(self.step) and self.density.measures(self.step // self.team.size):
             static = self._static_pixels(output, keep, sky)
             seen = SeenView(
-                output.projection, output.rendering.colors, output.painted, photo, static, output.developed
+                output.projection, output.rendering.colors, output.painted, target, static, output.developed
             )
             seen = self.density.before_backward(seen)
         skipped = self._report_marked()
@@ -265,7 +271,9 @@ class Trainer:
         photo: Float[Tensor, "H W 3"],
         keep: Bool[Tensor, "H W"] | None,
         sky: Bool[Tensor, "H W"] | None,
+        target: Float[Tensor, "H W 3"] | None = None,
     ) -> tuple[TrainingOutput, Losses]:
+        """Encodes and renders a photo, and compares the render with it or, if given, with the displaced photo."""
         stage = self.schedule.stage(self.step, self.method.sh_degree, self.team.size)
         rates, neighbours = self.photo_counts.dropout_rates(), self.config.dropout.neighbours
         stage = replace(stage, dropout=rates, neighbours=neighbours, absgrad=self.density.absgrad)
@@ -274,7 +282,7 @@ class Trainer:
         losses = self.loss(
             self._objective,
             self.schedule.mask_progress(self.step),
-            photo,
+            photo if target is None else target,
             output.picture,
             visibility=output.visibility,
             keep=keep,
@@ -357,6 +365,7 @@ class Trainer:
         state["progress.skipped"] = torch.tensor(self.guard.skipped)
         state["progress.hidden"] = self.consensus.state()
         state |= {f"dropout.{name}": value for name, value in self.photo_counts.state().items()}
+        state |= {f"warps.{name}": value for name, value in self.warps.state().items()}
         return state
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -376,6 +385,7 @@ class Trainer:
         self.guard.skipped = int(state.get("progress.skipped", 0))
         self.consensus.restore(state.get("progress.hidden", torch.zeros(3)))
         self.photo_counts.restore(_under(state, "dropout."))
+        self.warps.restore(_under(state, "warps."))
         if self.step < self.config.steps:
             self.method.finish(())
 

@@ -43,6 +43,7 @@ class Method(nn.Module, ABC):
         mask_threshold: Threshold Th: pixels with a higher visibility are static.
         masks_become_final: Whether masks are fixed once their decoder is no longer trained.
         flattens_ground: Whether Gaussians near the ground that few photos show are kept on its plane in training.
+        warps_photos: Whether training photos are displaced to where they fit their renders.
         uses_dropout: Whether Gaussians that few photos show are dropped in training (`Stage.dropout`).
         depth_supervised: Whether the depth loss applies to this method.
         sky_depth: Rendered depth below which something is in front of the sky, in units of the aligned frame; 0 for
@@ -65,6 +66,7 @@ class Method(nn.Module, ABC):
     mask_threshold: float = 0.5
     masks_become_final: bool = False
     flattens_ground: bool = False
+    warps_photos: bool = False
     uses_dropout: bool = False
     depth_supervised: bool = False
     sky_depth: float = 0.0

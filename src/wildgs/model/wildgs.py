@@ -48,6 +48,7 @@ class WildGS(Method):
     reset_every: ClassVar[int] = 0
     density: ClassVar[str] = "relocation"
     flattens_ground = True
+    warps_photos = True
     uses_dropout = True
     config: WildGSConfig
 

@@ -1,0 +1,236 @@
+"""Training photos are displaced to where they fit their renders, and nothing else moves them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter, map_coordinates
+from torch import Tensor
+
+from tests.engine.test_photo_counts import differences_after_resuming
+from tests.memory_views import with_photos
+from wildgs.engine.checkpoint import save_checkpoint
+from wildgs.engine.config import WarpConfig
+from wildgs.engine.photo_warps import EVERY, PhotoWarps, displacement, warp
+from wildgs.engine.report import StepReport
+from wildgs.engine.schedule import ScheduleConfig
+from wildgs.engine.team import Team
+from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.model.registry import MethodName, create_method
+from wildgs.model.wildgs import WildGSConfig
+from wildgs.scene import Scene
+
+HEIGHT, WIDTH, CELLS = 96, 128, 8
+CPU = torch.device("cpu")
+
+
+def texture(seed: int, height: int = HEIGHT, width: int = WIDTH) -> Float[np.ndarray, "H W 3"]:
+    """Smooth noise of a few pixels, as large as photos are."""
+    noise = np.random.default_rng(seed).normal(size=(height + 40, width + 40))
+    smooth = gaussian_filter(noise, 1.5)
+    return np.repeat((0.5 + 0.12 * smooth / smooth.std()).clip(0, 1)[..., None], 3, axis=2)
+
+
+def crop(picture: Float[np.ndarray, "H W 3"], x: float = 0.0, y: float = 0.0) -> Float[Tensor, "h w 3"]:
+    """The inside of a picture, shifted by pixels: pixel p shows what the picture has at p plus the shift."""
+    height, width = picture.shape[0] - 40, picture.shape[1] - 40
+    rows, columns = np.mgrid[20 : 20 + height, 20 : 20 + width].astype(float)
+    channels = [map_coordinates(picture[..., c], [rows + y, columns + x], order=5) for c in range(3)]
+    return torch.from_numpy(np.stack(channels, axis=-1).astype(np.float32))
+
+
+def constant(x: float, y: float, side: float = WIDTH) -> Float[Tensor, "2 G G"]:
+    """A grid of the same displacement everywhere, from pixels."""
+    return torch.tensor([x, y])[:, None, None].expand(2, CELLS, CELLS) / side
+
+
+def inside(picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
+    return picture[4:-4, 4:-4]
+
+
+@given(x=st.floats(-2.5, 2.5), y=st.floats(-2.5, 2.5))
+@settings(max_examples=25, deadline=None)
+def test_a_warped_photo_is_the_photo_sampled_at_displaced_pixels(x: float, y: float) -> None:
+    picture = texture(0)
+    warped = warp(crop(picture), constant(x, y))
+    torch.testing.assert_close(inside(warped), inside(crop(picture, x, y)), atol=0.02, rtol=0)
+
+
+def test_without_displacements_a_photo_stays_as_it_is() -> None:
+    photo = crop(texture(1, 61, 90))
+    torch.testing.assert_close(warp(photo, torch.zeros(2, 5, 5)), photo, atol=1e-5, rtol=0)
+
+
+@given(
+    x=st.floats(-0.8, 0.8),
+    y=st.floats(-0.8, 0.8),
+    gain=st.floats(0.3, 1.5),
+    offset=st.floats(-0.1, 0.2),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_shift_is_found_under_any_light(x: float, y: float, gain: float, offset: float) -> None:
+    picture = texture(2)
+    grid = constant(0, 0)
+    for _ in range(6):
+        moved = warp(crop(picture), grid)
+        grid = grid + displacement(moved, gain * crop(picture, x, y) + offset, CELLS)
+    found = WIDTH * grid[:, 1:-1, 1:-1]
+    torch.testing.assert_close(found, WIDTH * constant(x, y)[:, 1:-1, 1:-1], atol=0.06, rtol=0)
+
+
+def test_halves_of_a_photo_may_move_apart() -> None:
+    picture = texture(3)
+    left, right = crop(picture, 0.5), crop(picture, -0.5)
+    render = torch.cat([left[:, : WIDTH // 2], right[:, WIDTH // 2 :]], dim=1)
+    found = WIDTH * displacement(crop(picture), render, CELLS)[0]
+    assert found[:, :2].min() > 0.25
+    assert found[:, -2:].max() < -0.25
+
+
+def test_a_large_photo_is_registered_like_a_small_one() -> None:
+    """An enlargement to 1,280 pixels has the same displacement relative to its side."""
+    small, shifted = crop(texture(4, 240, 320)), crop(texture(4, 240, 320), 0.5)
+    large = [
+        torch.nn.functional.interpolate(picture.permute(2, 0, 1)[None], scale_factor=4, mode="bicubic")[
+            0
+        ].permute(1, 2, 0)
+        for picture in (small, shifted)
+    ]
+    found = displacement(large[0], large[1], CELLS)[0, 1:-1, 1:-1] * 320
+    assert found.median() == pytest.approx(0.5, abs=0.1)
+
+
+def test_passers_by_move_nothing() -> None:
+    picture = texture(5)
+    render, photo = crop(picture), crop(picture).clone()
+    photo[24:72, 32:64] = crop(texture(6))[24:72, 32:64]
+    assert WIDTH * displacement(photo, render, CELLS).abs().max() < 0.15
+
+
+@pytest.mark.parametrize("kind", ["flat", "not finite", "tiny"])
+def test_nothing_to_register_moves_nothing(kind: str) -> None:
+    photo = crop(texture(7)) if kind == "not finite" else torch.full((HEIGHT, WIDTH, 3), 0.5)
+    render = torch.full_like(photo, torch.nan if kind == "not finite" else 0.4)
+    if kind == "tiny":
+        photo, render = photo[:1, :2], render[:1, :2]
+    found = displacement(photo, render, CELLS)
+    torch.testing.assert_close(found, torch.zeros(2, CELLS, CELLS))
+    warp(photo, found)
+
+
+def warps_of(scene: Scene, config: WarpConfig, *, used: bool = True, begin: int = 0) -> PhotoWarps:
+    return PhotoWarps(scene.train_views, config, begin, CPU, used=used)
+
+
+def test_displacements_approach_the_shift_and_decrease_where_the_photo_fits(wall_scene: Scene) -> None:
+    warps = warps_of(wall_scene, WarpConfig(rate=0.5, friction=0.05, cells=CELLS))
+    view, picture = wall_scene.train_views[2], texture(8)
+
+    def visit(render: Float[Tensor, "H W 3"], times: int) -> float:
+        for step in range(EVERY - 1, EVERY * times, EVERY):
+            warps.update(view, warps.warped(view, crop(picture), step), render, step, Team())
+        return float(WIDTH * warps.grids[2, 0].median())
+
+    # In equilibrium, half of what is left is as much as friction: 0.5 of 0.6 pixels are found.
+    assert visit(crop(picture, 0.6), 20) == pytest.approx(0.5, abs=0.03)
+    assert visit(warps.warped(view, crop(picture), 0), 1) == pytest.approx(0.45, abs=0.03)
+    assert not warps.grids[[0, 1, 3]].any()
+
+
+def test_less_than_friction_moves_nothing(wall_scene: Scene) -> None:
+    warps, view = warps_of(wall_scene, WarpConfig(cells=CELLS, friction=0.05)), wall_scene.train_views[0]
+    for step in range(10):
+        warps.update(
+            view, warps.warped(view, crop(texture(11)), step), crop(texture(11), 0.06, -0.06), step, Team()
+        )
+    assert not warps.grids.any()
+
+
+def test_displacements_are_bounded(wall_scene: Scene) -> None:
+    warps, view = warps_of(wall_scene, WarpConfig(cells=CELLS, most=0.002)), wall_scene.train_views[0]
+    for step in range(8):
+        warps.update(view, crop(texture(9)), crop(texture(9), 0.9, -0.9), step, Team())
+    assert warps.grids[0].abs().max() == pytest.approx(0.002)
+    assert warps.grids[0, 0].median() == pytest.approx(0.002)
+    assert warps.grids[0, 1].median() == pytest.approx(-0.002)
+
+
+@pytest.mark.parametrize("reason", ["another method", "rate 0", "first stage", "step between"])
+def test_photos_stay_as_they_are(wall_scene: Scene, reason: str) -> None:
+    config = WarpConfig(rate=0.0 if reason == "rate 0" else 0.5, cells=CELLS)
+    begin = 10 if reason == "first stage" else 0
+    warps, view = (
+        warps_of(wall_scene, config, used=reason != "another method", begin=begin),
+        wall_scene.train_views[0],
+    )
+    photo = crop(texture(10))
+    warps.update(view, photo, crop(texture(10), 0.5), 8 if reason == "step between" else 9, Team())
+    assert not warps.grids.any()
+    if reason != "step between":
+        assert warps.warped(view, photo, 9) is photo
+    assert warps.has_begun(10) == (reason in ("first stage", "step between"))
+
+
+def test_displacements_of_another_collection_are_not_taken(wall_scene: Scene) -> None:
+    before = warps_of(wall_scene, WarpConfig(cells=CELLS))
+    before.grids += 0.001
+    fewer = replace(wall_scene, views=wall_scene.views[2:])
+    for scene, config in ((fewer, WarpConfig(cells=CELLS)), (wall_scene, WarpConfig(cells=CELLS + 1))):
+        after = warps_of(scene, config)
+        after.restore(before.state())
+        assert not after.grids.any()
+    same = warps_of(wall_scene, WarpConfig(cells=CELLS))
+    same.restore(before.state())
+    assert torch.equal(same.grids, before.grids)
+
+
+def trainer_for(scene: Scene, model: WildGSConfig, steps: int, name: MethodName = "wildgs") -> Trainer:
+    torch.manual_seed(0)
+    method = create_method(name, model if name == "wildgs" else None, scene)
+    schedule = ScheduleConfig(densify_every=0)
+    config = TrainConfig(
+        steps=steps, precision="float32", schedule=schedule, warp=WarpConfig(cells=4, most=0.05)
+    )
+    return Trainer(method, scene, config)
+
+
+def test_a_resumed_run_ends_in_the_same_bits(
+    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path
+) -> None:
+    whole = trainer_for(wall_scene, tiny_model, 24)
+
+    def save(report: StepReport) -> None:
+        if report.step == 15:
+            assert whole.warps.grids.any()
+            save_checkpoint(tmp_path, 15, whole.state(), {})
+
+    whole.run([save])
+    assert differences_after_resuming(whole, tmp_path, wall_scene, tiny_model) == []
+
+
+def test_baselines_train_on_photos_as_they_are(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    trainer = trainer_for(wall_scene, tiny_model, 12, "3dgs")
+    trainer.run()
+    assert not trainer.warps.is_used
+    assert not any(name.startswith("warps.") for name in trainer.state())
+
+
+def test_training_finds_the_photo_that_is_not_where_its_camera_says(
+    wall_scene: Scene, tiny_model: WildGSConfig
+) -> None:
+    """The second photo is a pixel off to the left."""
+    views = list(wall_scene.views)
+    photo = views[1].read_photo()
+    views[1] = with_photos(views[1], pixels=torch.cat([photo[:, 1:], photo[:, -1:]], dim=1).numpy())
+    trainer = trainer_for(replace(wall_scene, views=tuple(views)), tiny_model, 150)
+    trainer.run()
+    across = 32 * trainer.warps.grids[:, 0].mean(dim=(1, 2))
+    assert across[1] < -0.3
+    assert across[[0, 2, 3, 4, 5, 6]].abs().max() < 0.6 * across[1].abs()
