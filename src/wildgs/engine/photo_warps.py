@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from wildgs.devices import upload
 from wildgs.engine.config import WarpConfig
 from wildgs.engine.schedule import falls_on
 from wildgs.engine.team import Team
@@ -134,7 +135,7 @@ def warp(photo: Float[Tensor, "H W 3"], grid: Float[Tensor, "2 G G"]) -> Float[T
         padding_mode="border",
         align_corners=False,
     )
-    return warped[0].permute(1, 2, 0).clamp_(0, 1)
+    return warped[0].permute(1, 2, 0).contiguous().clamp_(0, 1)
 
 
 def displacement(
@@ -173,8 +174,7 @@ def displacement(
 
 def _fine_detail(*images: Float[Tensor, "H W 3"]) -> Float[Tensor, "K h w"]:
     """Brightness of images of at most `SIDE` pixels, without details coarser than `COARSE` pixels."""
-    red, green, blue = LUMA
-    grey = torch.stack([red * i[..., 0] + green * i[..., 1] + blue * i[..., 2] for i in images])
+    grey = torch.stack([image @ _luma(image.device) for image in images])
     scale = min(1.0, SIDE / max(grey.shape[1:]))
     height, width = (max(3, round(scale * side)) for side in grey.shape[1:])
     if (height, width) != grey.shape[1:]:
@@ -202,6 +202,11 @@ def _pooled(maps: Float[Tensor, "K H W"], height: int, width: int) -> Float[Tens
     rows = _pooling(maps.shape[1], height, maps.device)
     columns = _pooling(maps.shape[2], width, maps.device)
     return rows @ maps @ columns.T
+
+
+@lru_cache
+def _luma(device: torch.device) -> Float[Tensor, "3"]:
+    return upload(torch.tensor(LUMA), device)
 
 
 @lru_cache(maxsize=64)
