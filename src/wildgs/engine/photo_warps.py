@@ -36,9 +36,9 @@ COARSE = 4
 DAMPING = 0.01
 """Added to squared gradients of images of unit contrast, so that nothing is displaced where there is no texture."""
 FLAT = 1e-6
-"""Added to the variance of a cell: a hundredth of that of rounding to 8 bits."""
+"""Added to the variance of a cell: about that of rounding to 8 bits."""
 LONGEST = 1.0
-"""Largest displacement that is added at once, in pixels at `SIDE`; beyond it, the linear model is wrong."""
+"""Largest displacement found at once along an axis, in pixels of the reduced photo; the linear model ends there."""
 
 
 class PhotoWarps:
@@ -112,7 +112,7 @@ class PhotoWarps:
         """Continues from `state`; starts again if the number of photos or cells has changed."""
         grids = state.get("grids")
         if grids is not None and grids.shape == self.grids.shape:
-            self.grids = grids.to(self.grids.device)
+            self.grids = grids.to(self.grids.device).clone()
 
 
 def warp(photo: Float[Tensor, "H W 3"], grid: Float[Tensor, "2 G G"]) -> Float[Tensor, "H W 3"]:
