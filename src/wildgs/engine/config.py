@@ -170,7 +170,7 @@ class WarpConfig:
 
     rate: float = 0.5
     friction: float = 0.05
-    cells: int = 12
+    cells: int = 24
     most: float = 0.01
 
 

@@ -21,12 +21,9 @@ from torch.nn import functional
 
 from wildgs.devices import upload
 from wildgs.engine.config import WarpConfig
-from wildgs.engine.schedule import falls_on
 from wildgs.engine.team import Team
 from wildgs.scene import View
 
-EVERY = 2
-"""Displacements are updated in every n-th step, for speed."""
 SIDE = 480
 """Longer side, in pixels, to which larger photos are reduced for registration."""
 LUMA = (0.299, 0.587, 0.114)
@@ -94,7 +91,7 @@ class PhotoWarps:
             step: Number of steps taken.
             team: The processes that train, whose displacements are kept equal.
         """
-        if not (self.has_begun(step) and falls_on(step + team.size, team.size, EVERY)):
+        if not self.has_begun(step):
             return
         row, config = self._rows[view.name], self._config
         move = displacement(photo, render, config.cells)
