@@ -157,8 +157,10 @@ def displacement(
     down = functional.pad(seen[2:] - seen[:-2], (0, 0, 1, 1)) / 2
     pairs = [(seen, seen), (shown, shown), (seen, shown), (across, across), (across, down), (down, down)]
     pairs += [(across, shown), (down, shown), (across, seen), (down, seen)]
-    means = _pooled(torch.stack([first * second for first, second in pairs]), cells, cells)
-    means = _smoothed(means)
+    products = seen.new_empty(len(pairs), *seen.shape)
+    for product, (first, second) in zip(products, pairs, strict=True):
+        torch.mul(first, second, out=product)
+    means = _smoothed(_pooled(products, cells, cells))
     variance, both = means[0] + FLAT, ((means[0] + FLAT) * (means[1] + FLAT)).sqrt()
     likeness = (means[2] / both).clamp_min(0).square()
     gradients, errors = means[3:6] / variance, means[6:8] / both - means[8:10] / variance
