@@ -23,7 +23,7 @@ from benchmarks.pretend_cuda.tensors import Record
 from tests.engine.conftest import build_tiny_model, build_wall_scene
 from wildgs import features
 from wildgs.cli import main
-from wildgs.engine.config import DensityConfig, ScheduleConfig, TrainConfig
+from wildgs.engine.config import DensityConfig, ScheduleConfig, TrainConfig, WarpConfig
 from wildgs.engine.trainer import Trainer
 from wildgs.model.registry import MethodName, create_method
 
@@ -39,7 +39,8 @@ def trainer_on(device: str, method: MethodName) -> Trainer:
     torch.manual_seed(0)
     made = create_method(method, build_tiny_model() if method == "wildgs" else None, build_wall_scene())
     density = DensityConfig(grow_gradient=1e-5, max_gaussians=700)
-    config = TrainConfig(steps=20, precision="float32", schedule=SCHEDULE, density=density)
+    warp = WarpConfig(photos=0)
+    config = TrainConfig(steps=20, precision="float32", schedule=SCHEDULE, density=density, warp=warp)
     trainer = Trainer(made.to(device), build_wall_scene(), config)
     schedule = trainer.schedule
     schedule.densify_from, schedule.densify_every, schedule.reset_every = 3, 5, 11

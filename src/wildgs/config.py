@@ -41,6 +41,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.warp.friction": (0, 10),
     "train.warp.cells": (1, 256),
     "train.warp.most": (0, 0.2),
+    "train.warp.photos": (0, _MAX_VALUE),
     "model.mask_threshold": (0, 1),
     "model.matched_loss": (0, 1),
     "model.light_codes": (0, 64),

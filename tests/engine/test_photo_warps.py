@@ -125,8 +125,18 @@ def test_nothing_to_register_moves_nothing(kind: str) -> None:
     warp(photo, found)
 
 
-def warps_of(scene: Scene, config: WarpConfig, *, used: bool = True, begin: int = 0) -> PhotoWarps:
-    return PhotoWarps(scene.train_views, config, begin, CPU, used=used)
+@pytest.mark.cuda
+def test_a_gpu_finds_and_applies_the_same_displacements() -> None:
+    photo, render, grid = crop(texture(12)), crop(texture(12), 0.4, -0.3), constant(0.5, 0.2)
+    found = displacement(photo.cuda(), render.cuda(), CELLS).cpu()
+    torch.testing.assert_close(found, displacement(photo, render, CELLS), atol=1e-5, rtol=1e-3)
+    torch.testing.assert_close(warp(photo.cuda(), grid.cuda()).cpu(), warp(photo, grid), atol=1e-4, rtol=0)
+
+
+def warps_of(
+    scene: Scene, config: WarpConfig, *, used: bool = True, begin: int = 0, few: int = 7
+) -> PhotoWarps:
+    return PhotoWarps(scene.train_views, replace(config, photos=few), begin, CPU, used=used)
 
 
 def test_displacements_approach_the_shift_and_decrease_where_the_photo_fits(wall_scene: Scene) -> None:
@@ -162,14 +172,12 @@ def test_displacements_are_bounded(wall_scene: Scene) -> None:
     assert warps.grids[0, 1].median() == pytest.approx(-0.002)
 
 
-@pytest.mark.parametrize("reason", ["another method", "rate 0", "first stage"])
+@pytest.mark.parametrize("reason", ["another method", "rate 0", "first stage", "few photos"])
 def test_photos_stay_as_they_are(wall_scene: Scene, reason: str) -> None:
     config = WarpConfig(rate=0.0 if reason == "rate 0" else 0.5, cells=CELLS)
     begin = 10 if reason == "first stage" else 0
-    warps, view = (
-        warps_of(wall_scene, config, used=reason != "another method", begin=begin),
-        wall_scene.train_views[0],
-    )
+    few, used = 8 if reason == "few photos" else 7, reason != "another method"
+    warps, view = warps_of(wall_scene, config, used=used, begin=begin, few=few), wall_scene.train_views[0]
     photo = crop(texture(10))
     warps.update(view, photo, crop(texture(10), 0.5), 9, Team())
     assert not warps.grids.any()
@@ -182,7 +190,7 @@ def test_displacements_of_another_collection_are_not_taken(wall_scene: Scene) ->
     before.grids += 0.001
     fewer = replace(wall_scene, views=wall_scene.views[2:])
     for scene, config in ((fewer, WarpConfig(cells=CELLS)), (wall_scene, WarpConfig(cells=CELLS + 1))):
-        after = warps_of(scene, config)
+        after = warps_of(scene, config, few=0)
         after.restore(before.state())
         assert not after.grids.any()
     same = warps_of(wall_scene, WarpConfig(cells=CELLS))
@@ -195,7 +203,7 @@ def trainer_for(scene: Scene, model: WildGSConfig, steps: int, name: MethodName 
     method = create_method(name, model if name == "wildgs" else None, scene)
     schedule = ScheduleConfig(densify_every=0)
     config = TrainConfig(
-        steps=steps, precision="float32", schedule=schedule, warp=WarpConfig(cells=4, most=0.05)
+        steps=steps, precision="float32", schedule=schedule, warp=WarpConfig(cells=4, most=0.05, photos=0)
     )
     return Trainer(method, scene, config)
 

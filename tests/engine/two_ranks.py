@@ -17,7 +17,7 @@ import torch
 
 from conftest import build_tiny_model, build_wall_scene
 from wildgs.engine.checkpoint import Checkpoint
-from wildgs.engine.config import DensityConfig
+from wildgs.engine.config import DensityConfig, WarpConfig
 from wildgs.engine.density import SeenView
 from wildgs.engine.distributed import join
 from wildgs.engine.report import StepReport
@@ -42,7 +42,8 @@ def trainer_for(method: MethodName, team: Team, schedule: ScheduleConfig) -> Tra
     model = replace(model, wrapping=replace(model.wrapping, partial_lifts=0.0))
     made = create_method(method, model if method == "wildgs" else None, scene)
     density = DensityConfig(grow_gradient=2e-5)
-    config = TrainConfig(steps=STEPS, precision="float32", schedule=schedule, density=density)
+    warp = WarpConfig(photos=0)
+    config = TrainConfig(steps=STEPS, precision="float32", schedule=schedule, density=density, warp=warp)
     return Trainer(made, scene, config, team)
 
 

@@ -166,12 +166,14 @@ class WarpConfig:
             each time that the photo is used.
         cells: Number of cells along each side of a photo that are displaced independently.
         most: Largest displacement along each axis, relative to the photo's longer side.
+        photos: Smallest number of training photos. Fewer do not tell where a photo belongs from where the scene is.
     """
 
     rate: float = 0.5
     friction: float = 0.05
     cells: int = 24
     most: float = 0.01
+    photos: int = 40
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class PhotoWarps:
         """
         self._config, self._begin = config, begin
         self._rows = {view.name: row for row, view in enumerate(views)}
-        self.is_used = used and config.rate > 0
+        self.is_used = used and config.rate > 0 and len(views) >= config.photos
         self.grids = torch.zeros(len(views), 2, config.cells, config.cells, device=device)
 
     def has_begun(self, step: int) -> bool:
