@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 
 from resized_demo import write_resized_demo
-from wildgs.engine.config import DensityConfig
+from wildgs.engine.config import DensityConfig, WarpConfig
 from wildgs.engine.schedule import MASK_START
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
@@ -193,7 +193,8 @@ def make_trainer(
     kind = method_type(name)
     options = model if isinstance(model, kind.Config) else kind.Config()
     method = kind.from_points(options, scene.points[source] + noise, scene.point_colors[source])
-    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n))
+    warp = WarpConfig(photos=0)  # as in collections of more photos
+    config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n), warp=warp)
     trainer = Trainer(method.to(device), scene, config, team)
     trainer.cuda_graphs = graphs
     trainer.begin()
