@@ -23,11 +23,10 @@ from wildgs.devices import upload
 from wildgs.engine.config import WarpConfig
 from wildgs.engine.team import Team
 from wildgs.scene import View
+from wildgs.scene.images import LUMA
 
 SIDE = 480
 """Longer side, in pixels, to which larger photos are reduced for registration."""
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in brightness (Rec. 601)."""
 COARSE = 4
 """Cells of this many pixels, whose means are subtracted: light and shadow differ at coarser scales."""
 DAMPING = 0.01

@@ -45,6 +45,10 @@ DECODING_PIXELS = 100_000_000
 _open_lock = threading.Lock()
 
 
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in brightness (Rec. 601)."""
+
+
 class UnreadableImageError(Exception):
     """An image cannot be used; the message gives the reason without the file's name."""
 

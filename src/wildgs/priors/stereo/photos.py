@@ -13,8 +13,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 from wildgs.geometry.camera import Camera
 from wildgs.priors.stereo.cost_kernels import WORST, pack_blocks
 from wildgs.scene import View
-
-_GREY = (0.299, 0.587, 0.114)
+from wildgs.scene.images import LUMA
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Level:
     @classmethod
     def of_views(cls, views: Sequence[View]) -> Level:
         """Packs the photos of views at their resolution."""
-        weights = torch.tensor(_GREY)
+        weights = torch.tensor(LUMA)
         pictures = [(view.read_photo().float() / 255 @ weights).numpy() for view in views]
         return cls.of([view.camera for view in views], pictures)
 
