@@ -158,7 +158,7 @@ class FlatGroundConfig:
 
 @dataclass(frozen=True)
 class WarpConfig:
-    """Training photos are displaced to where they fit renders (`wildgs.engine.photo_warps`). Not in the paper.
+    """Training photos are displaced to where they fit renders (`wildgs.engine.warps`). Not in the paper.
 
     Attributes:
         rate: Fraction of an estimated displacement that is applied. 0 = off.

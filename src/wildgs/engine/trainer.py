@@ -21,12 +21,12 @@ from wildgs.engine.flat_ground import FlatGround
 from wildgs.engine.loss_replay import LossReplays
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.photo_counts import PhotoCounts
-from wildgs.engine.photo_warps import PhotoWarps
 from wildgs.engine.process_settings import ProcessSettings
 from wildgs.engine.report import Observer, StepReport
 from wildgs.engine.safety import StepGuard
 from wildgs.engine.schedule import Schedule
 from wildgs.engine.team import Team, same_everywhere
+from wildgs.engine.warps import PhotoWarps
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.losses.objective import Losses
 from wildgs.model.method import Method

@@ -18,11 +18,13 @@ from tests.engine.test_photo_counts import differences_after_resuming
 from tests.memory_views import with_photos
 from wildgs.engine.checkpoint import save_checkpoint
 from wildgs.engine.config import WarpConfig
-from wildgs.engine.photo_warps import PhotoWarps, displacement, warp
 from wildgs.engine.report import StepReport
 from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
+from wildgs.engine.warps import PhotoWarps
+from wildgs.engine.warps.registration import displacement
+from wildgs.engine.warps.resampling import warp
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.scene import Scene
