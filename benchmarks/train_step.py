@@ -193,7 +193,7 @@ def make_trainer(
     kind = method_type(name)
     options = model if isinstance(model, kind.Config) else kind.Config()
     method = kind.from_points(options, scene.points[source] + noise, scene.point_colors[source])
-    warp = WarpConfig(photos=0)  # as in collections of more photos
+    warp = WarpConfig(residuals=False, photos=0)  # as in collections of real photos
     config = TrainConfig(steps=30_000, density=DensityConfig(max_gaussians=n), warp=warp)
     trainer = Trainer(method.to(device), scene, config, team)
     trainer.cuda_graphs = graphs

@@ -39,7 +39,7 @@ def trainer_on(device: str, method: MethodName) -> Trainer:
     torch.manual_seed(0)
     made = create_method(method, build_tiny_model() if method == "wildgs" else None, build_wall_scene())
     density = DensityConfig(grow_gradient=1e-5, max_gaussians=700)
-    warp = WarpConfig(photos=0)
+    warp = WarpConfig(residuals=False, photos=0)
     config = TrainConfig(steps=20, precision="float32", schedule=SCHEDULE, density=density, warp=warp)
     trainer = Trainer(made.to(device), build_wall_scene(), config)
     schedule = trainer.schedule

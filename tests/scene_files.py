@@ -53,14 +53,15 @@ def write_model(
     *,
     camera: dict | None = None,
     binary: bool = True,
+    keypoints: Sequence[np.ndarray] | None = None,
 ) -> None:
-    """A sparse model in which every photo observes every point."""
+    """A sparse model in which every photo observes every point, at `keypoints` of each photo if given."""
     camera = camera or {"model": "PINHOLE", "width": WIDTH, "height": HEIGHT, "params": [40, 41, 24, 16]}
     model = pycolmap.Reconstruction()
     for index, (name, pose) in enumerate(zip(names, poses, strict=True), start=1):
         model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=index, **camera))
-        keypoints = np.zeros((len(points), 2))
-        image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=index, image_id=index)
+        seen = np.zeros((len(points), 2)) if keypoints is None else keypoints[index - 1]
+        image = pycolmap.Image(name=name, keypoints=seen, camera_id=index, image_id=index)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.ascontiguousarray(pose)))
     for row, point in enumerate(points):
         track = pycolmap.Track()

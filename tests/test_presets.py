@@ -32,6 +32,7 @@ MENDED = {
     "model.sky.points": 0,
     "train.dropout.rate": 0.0,
     "train.flat_ground.rate": 0.0,
+    "train.warp.residuals": False,
     "train.warp.rate": 0.0,
     "model.sky.densify": True,
     "model.sky.complete": False,

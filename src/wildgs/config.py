@@ -37,6 +37,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "train.dropout.neighbours": (1, 1024),
     "train.flat_ground.rate": (0, 1),
     "train.flat_ground.height": (0, _MAX_VALUE),
+    "train.warp.least_share": (0, 1),
     "train.warp.rate": (0, 1),
     "train.warp.friction": (0, 10),
     "train.warp.cells": (1, 256),

@@ -31,7 +31,8 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "schedule", "mask_visits"): ("mask_pause", 0),
     ("train", "dropout"): ("density", {"rate": 0.0}),
     ("train", "flat_ground"): ("density", {"rate": 0.0}),
-    ("train", "warp"): ("density", {"rate": 0.0}),
+    ("train", "warp"): ("density", {"rate": 0.0, "residuals": False}),
+    ("train", "warp", "residuals"): ("rate", False),
     ("train", "density", "strategy"): ("split_scale", "classic"),
 }
 """Entries that were added later: path -> (a sibling by which an older file is recognised, the older behaviour)."""

@@ -67,6 +67,7 @@ _PAPER: dict[str, Any] = {
     "train.optimizer.short_runs": 0.0,
     "train.dropout.rate": 0.0,
     "train.flat_ground.rate": 0.0,
+    "train.warp.residuals": False,
     "train.warp.rate": 0.0,
     "train.density.strategy": "classic",
     "train.density.prune_by_distance": False,

@@ -42,7 +42,7 @@ def trainer_for(method: MethodName, team: Team, schedule: ScheduleConfig) -> Tra
     model = replace(model, wrapping=replace(model.wrapping, partial_lifts=0.0))
     made = create_method(method, model if method == "wildgs" else None, scene)
     density = DensityConfig(grow_gradient=2e-5)
-    warp = WarpConfig(photos=0)
+    warp = WarpConfig(residuals=False, photos=0)
     config = TrainConfig(steps=STEPS, precision="float32", schedule=schedule, density=density, warp=warp)
     return Trainer(made, scene, config, team)
 

@@ -161,19 +161,26 @@ class WarpConfig:
     """Training photos are displaced to where they fit renders (`wildgs.engine.warps`). Not in the paper.
 
     Attributes:
-        rate: Fraction of an estimated displacement that is applied. 0 = off.
+        residuals: Begin from, and return to, displacements that residuals of structure from motion show. Photos
+            whose residuals show none are not displaced at all.
+        least_share: Smallest share of the variance of residuals that neighbours must have in common.
+        rate: Fraction of an estimated displacement that is applied. 0 = leave photos where residuals show them or,
+            without `residuals`, as they are.
         friction: Pixels, of a photo whose longer side is reduced to at most 480, by which displacements decrease
             each time that the photo is used.
         cells: Number of cells along each side of a photo that are displaced independently.
         most: Largest displacement along each axis, relative to the photo's longer side.
-        photos: Smallest number of training photos. Fewer do not tell where a photo belongs from where the scene is.
+        photos: Smallest number of training photos that renders displace. Fewer do not tell where a photo belongs
+            from where the scene is.
     """
 
+    residuals: bool = True
+    least_share: float = 0.08
     rate: float = 0.5
     friction: float = 0.05
     cells: int = 24
     most: float = 0.01
-    photos: int = 40
+    photos: int = 16
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,9 @@ class Trainer:
         self.flat_ground = FlatGround(method, scene, config.flat_ground)
         self.photo_counts = PhotoCounts(method, config.dropout, config.steps, needed=self.flat_ground.is_used)
         begin = self.schedule.first_stage
-        self.warps = PhotoWarps(self.views, config.warp, begin, self.device, used=method.warps_photos)
+        self.warps = PhotoWarps(
+            self.views, config.warp, begin, self.device, scene.residuals, used=method.warps_photos
+        )
         self.guard = StepGuard()
         self.loss = LossReplays()
         self.skips_on_device = self.device.type == "cuda" and features.is_on("skip_on_device")
@@ -154,7 +156,7 @@ class Trainer:
         if self.step == 0:
             with self.team.propagate_errors():
                 self._prepare()
-        self.team.share(self.method.state_dict().values())
+        self.team.share([*self.method.state_dict().values(), *self.warps.tensors()])
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
         self.loss.switch(self.cuda_graphs)
@@ -177,7 +179,7 @@ class Trainer:
         view = self.feed.next_view()
         self.optimizers.set_progress(self.schedule.progress(self.step))
         photo, keep = self.feed.photo(view)
-        target = self.warps.warped(view, photo, self.step)
+        target = self.warps.warped(view, photo)
         sky = self._sky(view)
         output, losses = self._forward(view, photo, keep, sky, target)
         self.warps.update(view, target, output.picture.detach(), self.step, self.team)

@@ -22,7 +22,7 @@ ENTRIES_WITHOUT: Mapping[str, Mapping[str, Any]] = {
     "stereo": {"data.use_metric_depth": False},
     "dropout": {"train.dropout.rate": 0.0},
     "flat-ground": {"train.flat_ground.rate": 0.0},
-    "warp": {"train.warp.rate": 0.0},
+    "warp": {"train.warp.rate": 0.0, "train.warp.residuals": False},
     "growth": {"train.schedule.densify_every": 0},
 }
 """Ablations of what the paper does not have: the entries of `config.yaml` that switch each part off."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, Int64, UInt8, UInt64
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
@@ -44,12 +44,16 @@ class ColmapImage:
         camera: pycolmap's camera (any model), for the stored pixel grid of the photo.
         viewmat: World-to-camera transform in the model's frame.
         median_depth: Median depth of the points that this photo observes; None without observations.
+        shown: Indices of the points that SfM found in this photo.
+        pixels: Where: pixels (x, y) of the stored photo, not undistorted.
     """
 
     name: str
     camera: Any
     viewmat: Float[Tensor, "4 4"]
     median_depth: float | None
+    shown: Int64[np.ndarray, " K"]
+    pixels: Float32[np.ndarray, "K 2"]
 
 
 @dataclass(frozen=True)
@@ -117,19 +121,34 @@ def read_model(root: Path) -> ColmapModel:
         raise UserError(f"{folder}: the COLMAP model has no points, which training needs; triangulate it")
     viewmats = {image.image_id: _viewmat(image) for image in registered}
     depths = _median_depths(records.points, finite, viewmats)
-    images = tuple(
-        ColmapImage(
-            name=_checked_name(image.name, folder),
-            camera=records.cameras[image.camera_id],
-            viewmat=torch.from_numpy(viewmats[image.image_id]),
-            median_depth=depths.get(image.image_id),
+    images = []
+    for image in registered:
+        shown, pixels = _shown_points(image, records.points.ids[finite])
+        images.append(
+            ColmapImage(
+                name=_checked_name(image.name, folder),
+                camera=records.cameras[image.camera_id],
+                viewmat=torch.from_numpy(viewmats[image.image_id]),
+                median_depth=depths.get(image.image_id),
+                shown=shown,
+                pixels=pixels,
+            )
         )
-        for image in registered
-    )
     _refuse_repeated([image.name for image in images], folder)
     points, colors = records.points.xyz[finite], records.points.rgb[finite]
     observations = _observations(records.points, finite, [image.image_id for image in registered])
-    return ColmapModel(images_dir, images, torch.from_numpy(points), torch.from_numpy(colors), observations)
+    return ColmapModel(
+        images_dir, tuple(images), torch.from_numpy(points), torch.from_numpy(colors), observations
+    )
+
+
+def _shown_points(
+    image: ImageRecord, ids: UInt64[np.ndarray, " P"]
+) -> tuple[Int64[np.ndarray, " K"], Float32[np.ndarray, "K 2"]]:
+    """Indices in `ids`, which are sorted, of the points that a photo shows, and their pixels."""
+    found = np.searchsorted(ids, image.points.point_ids).clip(max=len(ids) - 1)
+    usable = ids[found] == image.points.point_ids
+    return found[usable].astype(np.int64), image.points.pixels[usable]
 
 
 def _observations(points: PointRecords, finite: np.ndarray, image_ids: Sequence[int]) -> Int[Tensor, "T 2"]:

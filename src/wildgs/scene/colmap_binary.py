@@ -11,6 +11,7 @@ import numpy as np
 from wildgs.scene.colmap_records import (
     MAX_FILE_BYTES,
     MAX_NAME_BYTES,
+    ImagePoints,
     ImageRecord,
     ModelFileError,
     ModelRecords,
@@ -24,7 +25,8 @@ _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT = struct.Struct("<Q3d3Bd")
 _COUNT = struct.Struct("<Q")
-_POINT2D_BYTES, _TRACK_BYTES = 24, 8
+_POINT2D = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
+_TRACK_BYTES = 8
 
 
 def read_binary(folder: Path) -> ModelRecords:
@@ -63,11 +65,7 @@ class _Bytes:
         self._need(number * least_bytes)
         return number
 
-    def skip(self, size: int) -> None:
-        self._need(size)
-        self.position += size
-
-    def array(self, dtype: str, count: int) -> np.ndarray:
+    def array(self, dtype: str | np.dtype, count: int) -> np.ndarray:
         size = np.dtype(dtype).itemsize * count
         self._need(size)
         values = np.frombuffer(self.data, dtype, count, self.position)
@@ -113,8 +111,9 @@ def _read_images(file: _Bytes) -> list[ImageRecord]:
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size)):
         image_id, *pose, camera_id = file.take(_IMAGE)
         name = file.text()
-        file.skip(file.count(_POINT2D_BYTES) * _POINT2D_BYTES)
-        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
+        shown = file.array(_POINT2D, file.count(_POINT2D.itemsize))
+        points = ImagePoints.of(shown["point"], shown["pixel"])
+        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, name, points))
     file.finish()
     return images
 

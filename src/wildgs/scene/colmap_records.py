@@ -1,7 +1,8 @@
 """Records of a COLMAP model, for the readers of both formats, which validate all data.
 
 COLMAP's own reader trusts the counts that a file declares, so that a damaged or malicious file can crash the
-process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". Image points (points2D) are skipped.
+process (docs/robustness.md). Format: COLMAP's documentation, "Output Format". Image points (points2D) without a
+point are skipped.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8, UInt64
 
 MAX_FILE_BYTES = 16 * 2**30
 MAX_NAME_BYTES = 4096
@@ -24,14 +25,35 @@ class ModelFileError(Exception):
 
 
 @dataclass(frozen=True)
+class ImagePoints:
+    """The points that a photo shows, and where.
+
+    Attributes:
+        point_ids: Ids of the points.
+        pixels: Pixels (x, y) of the stored photo; the centre of the upper left pixel is (0.5, 0.5).
+    """
+
+    point_ids: UInt64[np.ndarray, " K"]
+    pixels: Float32[np.ndarray, "K 2"]
+
+    @classmethod
+    def of(cls, point_ids: Int64[np.ndarray, " K"], pixels: Float64[np.ndarray, "K 2"]) -> ImagePoints:
+        """Those of all image points that belong to a point, whose id is not -1."""
+        chosen = point_ids >= 0
+        with np.errstate(over="ignore"):
+            return cls(point_ids[chosen].astype(np.uint64), pixels[chosen].astype(np.float32))
+
+
+@dataclass(frozen=True)
 class ImageRecord:
-    """A photo's pose as stored (world to camera)."""
+    """A photo's pose as stored (world to camera), and the points that it shows."""
 
     image_id: int
     quat: tuple[float, float, float, float]
     translation: tuple[float, float, float]
     camera_id: int
     name: str
+    points: ImagePoints
 
 
 @dataclass
@@ -39,12 +61,14 @@ class PointRecords:
     """Sparse points and their tracks, sorted by id.
 
     Attributes:
+        ids: The points' ids.
         xyz: Positions.
         rgb: Colours.
         track_point: Index of the point of each observation.
         track_image: Id of the photo of each observation.
     """
 
+    ids: UInt64[np.ndarray, " P"]
     xyz: Float64[np.ndarray, "P 3"]
     rgb: UInt8[np.ndarray, "P 3"]
     track_point: Int64[np.ndarray, "T"]
@@ -83,11 +107,13 @@ class PointList:
         """
         if len(set(self.ids)) != len(self.ids):
             raise ModelFileError(f"{where}: two points have the same id")
-        order = np.argsort(np.array(self.ids, dtype=np.uint64), kind="stable")
+        ids = np.array(self.ids, dtype=np.uint64)
+        order = np.argsort(ids, kind="stable")
         tracks = [self.tracks[index] for index in order]
         lengths = np.array([len(track) for track in tracks], dtype=np.int64)
         joined = np.concatenate(tracks) if tracks else np.zeros(0)
         return PointRecords(
+            ids=ids[order],
             xyz=np.array(self.xyz, dtype=np.float64).reshape(-1, 3)[order],
             rgb=np.array(self.rgb, dtype=np.uint8).reshape(-1, 3)[order],
             track_point=np.repeat(np.arange(len(tracks), dtype=np.int64), lengths),

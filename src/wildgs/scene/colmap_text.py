@@ -15,6 +15,7 @@ from wildgs.errors import WildGSWarning
 from wildgs.scene.colmap_records import (
     MAX_FILE_BYTES,
     MAX_NAME_BYTES,
+    ImagePoints,
     ImageRecord,
     ModelFileError,
     ModelRecords,
@@ -104,10 +105,20 @@ def _read_images(path: Path) -> list[ImageRecord]:
         pose = _numbers(where, float, fields[1:8], 7)
         if len(fields[9].encode(errors="surrogateescape")) > MAX_NAME_BYTES:
             raise ModelFileError(f"{where}: a name of more than {MAX_NAME_BYTES} bytes")
-        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, fields[9]))
-        next(lines, None)
+        points = _image_points(*next(lines, (where, "")))
+        images.append(ImageRecord(image_id, tuple(pose[:4]), tuple(pose[4:]), camera_id, fields[9], points))
     _check_count(path, len(images))
     return images
+
+
+def _image_points(where: str, line: str) -> ImagePoints:
+    """Reads x, y and the id of a point, or -1, again and again."""
+    try:
+        numbers = np.array(line.split(), dtype=np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise ModelFileError(f"{where}: image points that are not triples of numbers") from error
+    ids = np.nan_to_num(numbers[:, 2], nan=-1).clip(-1, 2**62).astype(np.int64)
+    return ImagePoints.of(ids, numbers[:, :2])
 
 
 def _read_points(path: Path) -> PointRecords:

@@ -13,11 +13,12 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.progress import Counter, in_threads
 from wildgs.scene.alignment import align_world
-from wildgs.scene.colmap import ColmapImage, describe_names, read_model
+from wildgs.scene.colmap import ColmapImage, ColmapModel, describe_names, read_model
 from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
 from wildgs.scene.image_cache import DECODERS, ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.photo_store import ScenePhotos
+from wildgs.scene.residuals import Residuals, residuals_of
 from wildgs.scene.scene import Alignment, Scene, Split, View, observations_of
 from wildgs.scene.split import assign_splits
 from wildgs.scene.undistort import PixelGrid
@@ -89,10 +90,20 @@ def load_scene(
         point_colors=model.point_colors,
         alignment=alignment,
         observations=observations_of(model.observations, names, views),
+        residuals={} if lazy else _residuals(model, views, config),
     )
     if photos.use_metric_depth and not lazy:
         refuse_other_units(scene)
     return scene
+
+
+def _residuals(model: ColmapModel, views: Sequence[View], config: DataConfig) -> dict[str, Residuals]:
+    images = {image.name: image for image in model.images}
+    return {
+        view.name: residuals_of(images[view.name], model.points, _pixel_grid(images[view.name], config))
+        for view in views
+        if view.split == "train"
+    }
 
 
 def _report_unused(photos: ScenePhotos) -> None:

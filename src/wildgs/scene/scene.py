@@ -16,6 +16,7 @@ from wildgs.devices import upload
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.scene.photo_store import PhotoStore
+from wildgs.scene.residuals import Residuals
 
 Split = Literal["train", "test"]
 MAX_LISTED = 3
@@ -170,6 +171,7 @@ class Scene:
         point_colors: Colours of the points.
         alignment: Transform from the COLMAP model's frame to the aligned frame.
         observations: Index in `views` and index in `points` of each observation of a point in a photo.
+        residuals: Residuals of SfM by the names of photos; empty if the scene was not loaded from a COLMAP model.
     """
 
     root: Path
@@ -178,6 +180,7 @@ class Scene:
     point_colors: UInt8[Tensor, "P 3"]
     alignment: Alignment
     observations: Int[Tensor, "T 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.int32))
+    residuals: Mapping[str, Residuals] = field(default_factory=dict)
 
     @property
     def train_views(self) -> tuple[View, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from wildgs.engine.warps.resampling import warp
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.scene import Scene
+from wildgs.scene.residuals import Residuals
 
 HEIGHT, WIDTH, CELLS = 96, 128, 8
 CPU = torch.device("cpu")
@@ -136,9 +138,63 @@ def test_a_gpu_finds_and_applies_the_same_displacements() -> None:
 
 
 def warps_of(
-    scene: Scene, config: WarpConfig, *, used: bool = True, begin: int = 0, few: int = 7
+    scene: Scene,
+    config: WarpConfig,
+    *,
+    used: bool = True,
+    begin: int = 0,
+    few: int = 7,
+    residuals: Mapping[str, Residuals] | None = None,
 ) -> PhotoWarps:
-    return PhotoWarps(scene.train_views, replace(config, photos=few), begin, CPU, used=used)
+    """Displaced by renders alone unless there are residuals."""
+    config = replace(config, photos=few, residuals=residuals is not None)
+    return PhotoWarps(scene.train_views, config, begin, CPU, residuals or {}, used=used)
+
+
+def residuals_of(scene: Scene, x: float, noise: float = 0.0) -> dict[str, Residuals]:
+    """Of photos that are all displaced by x pixels along the first axis."""
+    torch.manual_seed(0)
+    return {
+        view.name: Residuals(torch.rand(200, 2), (torch.tensor([x, 0]) + noise * torch.randn(200, 2)) / WIDTH)
+        for view in scene.train_views
+    }
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5])
+def test_photos_begin_where_residuals_show_them(wall_scene: Scene, rate: float) -> None:
+    residuals = residuals_of(wall_scene, 0.4, noise=0.05)
+    warps = warps_of(wall_scene, WarpConfig(rate=rate, cells=CELLS), begin=100, residuals=residuals)
+    view, picture = wall_scene.train_views[0], texture(13)
+    assert WIDTH * warps.grids[:, 0].mean() == pytest.approx(0.4, abs=0.05)
+    assert WIDTH * warps.grids[:, 1].square().mean().sqrt() < 0.1
+    warped = warps.warped(view, crop(picture))
+    torch.testing.assert_close(inside(warped), inside(crop(picture, 0.4)), atol=0.05, rtol=0)
+
+
+@pytest.mark.parametrize("few", [0, 100])
+def test_photos_return_to_where_residuals_show_them(wall_scene: Scene, few: int) -> None:
+    """A photo without texture has no place of its own; fewer photos than `photos` are not registered at all."""
+    residuals = residuals_of(wall_scene, 0.4)
+    warps = warps_of(wall_scene, WarpConfig(cells=CELLS), few=few, residuals=residuals)
+    view, first = wall_scene.train_views[0], warps.grids.clone()
+    for step in range(20):
+        warps.update(view, warps.warped(view, crop(texture(14))), crop(texture(14), -0.4), step, Team())
+    moved = WIDTH * (warps.grids[0, 0] - first[0, 0]).median()
+    assert moved == pytest.approx(0 if few else -0.7, abs=0.05)
+    flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
+    for step in range(30):
+        warps.update(view, flat, flat, step, Team())
+    torch.testing.assert_close(warps.grids, first)
+
+
+def test_photos_without_common_residuals_stay_as_they_are(wall_scene: Scene) -> None:
+    residuals = residuals_of(wall_scene, 0.0, noise=0.3)
+    warps = warps_of(wall_scene, WarpConfig(cells=CELLS), residuals=residuals)
+    photo = crop(texture(15))
+    warps.update(wall_scene.train_views[0], photo, crop(texture(15), 0.5), 0, Team())
+    assert not warps.is_used
+    assert not warps.grids.any()
+    assert warps.warped(wall_scene.train_views[0], photo) is photo
 
 
 def test_displacements_approach_the_shift_and_decrease_where_the_photo_fits(wall_scene: Scene) -> None:
@@ -147,12 +203,12 @@ def test_displacements_approach_the_shift_and_decrease_where_the_photo_fits(wall
 
     def visit(render: Float[Tensor, "H W 3"], times: int) -> float:
         for step in range(times):
-            warps.update(view, warps.warped(view, crop(picture), step), render, step, Team())
+            warps.update(view, warps.warped(view, crop(picture)), render, step, Team())
         return float(WIDTH * warps.grids[2, 0].median())
 
     # In equilibrium, half of what is left is as much as friction: 0.5 of 0.6 pixels are found.
     assert visit(crop(picture, 0.6), 20) == pytest.approx(0.5, abs=0.03)
-    assert visit(warps.warped(view, crop(picture), 0), 1) == pytest.approx(0.45, abs=0.03)
+    assert visit(warps.warped(view, crop(picture)), 1) == pytest.approx(0.45, abs=0.03)
     assert not warps.grids[[0, 1, 3]].any()
 
 
@@ -160,7 +216,7 @@ def test_less_than_friction_moves_nothing(wall_scene: Scene) -> None:
     warps, view = warps_of(wall_scene, WarpConfig(cells=CELLS, friction=0.05)), wall_scene.train_views[0]
     for step in range(10):
         warps.update(
-            view, warps.warped(view, crop(texture(11)), step), crop(texture(11), 0.06, -0.06), step, Team()
+            view, warps.warped(view, crop(texture(11))), crop(texture(11), 0.06, -0.06), step, Team()
         )
     assert not warps.grids.any()
 
@@ -183,8 +239,9 @@ def test_photos_stay_as_they_are(wall_scene: Scene, reason: str) -> None:
     photo = crop(texture(10))
     warps.update(view, photo, crop(texture(10), 0.5), 9, Team())
     assert not warps.grids.any()
-    assert warps.warped(view, photo, 9) is photo
-    assert warps.has_begun(10) == (reason == "first stage")
+    torch.testing.assert_close(warps.warped(view, photo), photo, atol=1e-5, rtol=0)
+    warps.update(view, photo, crop(texture(10), 0.5), 10, Team())
+    assert bool(warps.grids.any()) == (reason == "first stage")
 
 
 def test_displacements_of_another_collection_are_not_taken(wall_scene: Scene) -> None:
@@ -204,9 +261,8 @@ def trainer_for(scene: Scene, model: WildGSConfig, steps: int, name: MethodName 
     torch.manual_seed(0)
     method = create_method(name, model if name == "wildgs" else None, scene)
     schedule = ScheduleConfig(densify_every=0)
-    config = TrainConfig(
-        steps=steps, precision="float32", schedule=schedule, warp=WarpConfig(cells=4, most=0.05, photos=0)
-    )
+    warp = WarpConfig(residuals=False, cells=4, most=0.05, photos=0)
+    config = TrainConfig(steps=steps, precision="float32", schedule=schedule, warp=warp)
     return Trainer(method, scene, config)
 
 
