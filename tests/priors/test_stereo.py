@@ -10,13 +10,14 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.memory_views import make_view
+from tests.memory_views import make_view, with_photos
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
 from wildgs.priors.config import StereoConfig
 from wildgs.priors.stereo.depth import fill_metric_folder, stereo_depth
 from wildgs.priors.stereo.neighbours import choose_neighbours
 from wildgs.scene import Alignment, DataConfig, Scene, load_scene
+from wildgs.scene.residuals import Residuals
 from wildgs.threads import limited
 
 WIDTH, HEIGHT, FOCAL, SKY = 64, 48, 70.0, 8
@@ -82,6 +83,30 @@ def test_depth_is_right_where_it_is_known(depths: dict[str, np.ndarray]) -> None
         error = np.abs(found / truth - 1)[SKY + 4 :][known]
         assert known.mean() > 0.4
         assert (error < 0.02).mean() > 0.85
+
+
+def test_photos_are_displaced_to_where_residuals_show_them() -> None:
+    """Every second photo is a pixel off to the right."""
+    whole = scene()
+    views = [
+        view if row % 2 == 0 else with_photos(view, pixels=np.roll(view.read_photo().numpy(), 1, axis=1))
+        for row, view in enumerate(whole.views)
+    ]
+    places = torch.rand(200, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [1, HEIGHT / WIDTH]
+    )
+    residuals = {
+        view.name: Residuals(places, torch.tensor([(row % 2) / WIDTH, 0]).expand(200, 2))
+        for row, view in enumerate(views)
+    }
+
+    def median_error(residuals: dict[str, Residuals]) -> float:
+        found = stereo_depth(replace(whole, views=tuple(views), residuals=residuals), StereoConfig())
+        errors = [np.abs(found[f"{row}.png"] / true_depth(camera(row)).numpy() - 1) for row in (1, 2, 3)]
+        return float(np.median(np.concatenate([error[SKY + 4 :][error[SKY + 4 :] < 1] for error in errors])))
+
+    assert median_error(residuals) < 0.006
+    assert median_error({}) > 0.01
 
 
 def test_sky_and_passers_by_have_no_depth(depths: dict[str, np.ndarray]) -> None:

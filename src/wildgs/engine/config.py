@@ -8,6 +8,7 @@ from typing import Literal
 from wildgs.errors import UserError
 from wildgs.losses.config import ObjectiveConfig
 from wildgs.model.config import DropoutConfig, Precision
+from wildgs.priors.config import CELLS, LEAST_SHARE
 
 
 @dataclass(frozen=True)
@@ -175,10 +176,10 @@ class WarpConfig:
     """
 
     residuals: bool = True
-    least_share: float = 0.08
+    least_share: float = LEAST_SHARE
     rate: float = 0.5
     friction: float = 0.05
-    cells: int = 24
+    cells: int = CELLS
     most: float = 0.01
     photos: int = 16
 

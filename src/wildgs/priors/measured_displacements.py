@@ -19,6 +19,7 @@ from scipy.linalg import solve
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
+from wildgs.priors.config import CELLS, LEAST_SHARE
 from wildgs.progress import in_threads
 from wildgs.scene import View
 from wildgs.scene.residuals import Residuals
@@ -77,7 +78,10 @@ class MeasuredDisplacements:
 
 
 def measured_displacements(
-    views: Sequence[View], residuals: Mapping[str, Residuals], cells: int, least_share: float
+    views: Sequence[View],
+    residuals: Mapping[str, Residuals],
+    cells: int = CELLS,
+    least_share: float = LEAST_SHARE,
 ) -> MeasuredDisplacements:
     """Estimates how photos are displaced.
 

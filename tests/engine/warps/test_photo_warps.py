@@ -25,9 +25,9 @@ from wildgs.engine.team import Team
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.engine.warps import PhotoWarps
 from wildgs.engine.warps.registration import displacement
-from wildgs.engine.warps.resampling import warp
 from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
+from wildgs.priors.resampling import warp
 from wildgs.scene import Scene
 from wildgs.scene.residuals import Residuals
 

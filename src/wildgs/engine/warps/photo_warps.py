@@ -23,8 +23,8 @@ from wildgs.devices import upload
 from wildgs.engine.config import WarpConfig
 from wildgs.engine.team import Team
 from wildgs.engine.warps.registration import SIDE, displacement
-from wildgs.engine.warps.resampling import warp
 from wildgs.priors.measured_displacements import measured_displacements
+from wildgs.priors.resampling import warp
 from wildgs.scene import View
 from wildgs.scene.residuals import Residuals
 

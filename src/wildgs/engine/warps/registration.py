@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from wildgs.devices import upload
-from wildgs.engine.warps.resampling import between, interpolated, interpolation, pooled, pooling
-from wildgs.engine.warps.warp_kernels import (
+from wildgs.engine.warps.registration_kernels import (
     PRODUCTS,
     ROWS,
     grey_rows,
@@ -19,6 +18,7 @@ from wildgs.engine.warps.warp_kernels import (
     sum_products,
     sum_rows,
 )
+from wildgs.priors.resampling import between, interpolated, interpolation, pooled, pooling
 from wildgs.scene.images import LUMA
 from wildgs.threads import launch
 

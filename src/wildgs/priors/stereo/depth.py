@@ -16,6 +16,7 @@ from wildgs.errors import WildGSWarning
 from wildgs.files import written_aside
 from wildgs.priors.config import GroundConfig, StereoConfig
 from wildgs.priors.ground import find_ground
+from wildgs.priors.measured_displacements import measured_displacements
 from wildgs.priors.stereo.agreement_kernels import count_agreeing, drop_specks
 from wildgs.priors.stereo.neighbours import choose_neighbours, seen_rows
 from wildgs.priors.stereo.photos import Level, Planes
@@ -33,6 +34,8 @@ def stereo_depth(
 ) -> dict[str, Float32[np.ndarray, "H W"]]:
     """Estimates the depth of the training photos; test photos are not used.
 
+    Photos that are not where their cameras say are displaced first, as far as SfM has measured it.
+
     Args:
         scene: A scene with photos at matching resolution.
         config: Number of neighbours and thresholds of consistency.
@@ -43,7 +46,8 @@ def stereo_depth(
     """
     views = scene.train_views
     neighbours = choose_neighbours(scene, config.neighbours)
-    fine = Level.of_views(views)
+    measured = measured_displacements(views, scene.residuals)
+    fine = Level.of_views(views, measured.grids if measured.grids.any() else None)
     coarse = fine.halved()
     ground = _ground(scene)
     found, refined = coarse.no_planes(), fine.no_planes()

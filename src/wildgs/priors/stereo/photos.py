@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int, UInt64
+from jaxtyping import Float, Float32, Int, UInt64
+from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from wildgs.geometry.camera import Camera
+from wildgs.priors.resampling import warp
 from wildgs.priors.stereo.cost_kernels import WORST, pack_blocks
 from wildgs.scene import View
 from wildgs.scene.images import LUMA
@@ -51,10 +53,14 @@ class Level:
         return cls(list(cameras), pixels, blocks, np.array(layout))
 
     @classmethod
-    def of_views(cls, views: Sequence[View]) -> Level:
-        """Packs the photos of views at their resolution."""
-        weights = torch.tensor(LUMA)
-        pictures = [(view.read_photo().float() / 255 @ weights).numpy() for view in views]
+    def of_views(cls, views: Sequence[View], displacements: Float[Tensor, "V 2 G G"] | None = None) -> Level:
+        """Packs the photos of views at their resolution, displaced to where their cameras say (see `warp`)."""
+        weights, pictures = torch.tensor(LUMA), []
+        for row, view in enumerate(views):
+            photo = view.read_photo().float() / 255
+            if displacements is not None:
+                photo = warp(photo, displacements[row])
+            pictures.append((photo @ weights).numpy())
         return cls.of([view.camera for view in views], pictures)
 
     def halved(self) -> Level:

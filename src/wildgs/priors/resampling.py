@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from wildgs.engine.warps.warp_kernels import ROWS, warp_rows
+from wildgs.priors.resampling_kernels import ROWS, warp_rows
 from wildgs.threads import launch
 
 
