@@ -1,14 +1,18 @@
-"""Do displacements of training photos agree with what structure from motion measured?
+"""Are photos where their cameras say, and do displacements found in training agree with structure from motion?
 
-    python benchmarks/displacements.py SCENE RUN ...
+    python benchmarks/displacements.py SCENE [RUN ...]
 
-Training displaces photos to where they fit its renders (`--warp.rate`). Structure from motion leaves residuals of
-its own: where a photo shows a point, less where its camera projects it. It knows nothing of renders, so that the
-two agree only if the photos really are there. Printed are the numbers of observations, the root mean squares of
-displacements and residuals (at most 2 pixels) there, in pixels of photos whose longer side has 320, the
-correlation of the two; then, over points that six photos or more observe, the share of the displacements that
-moving the points explains, and the same after the displacements of every second photo, chosen at random, have been
-turned around. Were scene and photos to drift together, the first share would be larger.
+Residuals of structure from motion, where a photo shows a point less where its camera projects it, are partly noise
+of the detector and partly displacements of the photo, which neighbours have in common. Printed are the share of the
+variance that they have in common, its root mean square in pixels of photos whose longer side has 320, and the
+distance at which it falls to exp(-1/2). Photos are displaced if the share is at least `--warp.least-share`.
+
+For each run, whose photos must have been displaced: the numbers of observations, root mean squares of displacements
+and residuals (at most 2 pixels) there, and their correlation. With `--warp.no-residuals`, registration with renders
+knows nothing of residuals, so that the two agree only if the photos really are there. Then, over points that six
+photos or more observe, the share of the displacements that moving the points explains, and the same after those of
+photos chosen at random have been turned around. Were scene and photos to drift together, the first share would be
+larger.
 """
 
 from __future__ import annotations
@@ -20,12 +24,13 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
 
 import wildgs
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
+from wildgs.priors.measured_displacements import scene_covariance
+from wildgs.scene import DataConfig, load_scene
 
 SIDE = 320
 LARGEST = 2.0
@@ -103,9 +108,18 @@ def main() -> None:
     """Prints a line for each run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scene", type=Path, help="COLMAP scene")
-    parser.add_argument("runs", type=Path, nargs="+", help="runs trained on it with displaced photos")
+    parser.add_argument("runs", type=Path, nargs="*", help="runs trained on it with displaced photos")
     arguments = parser.parse_args()
-    torch.manual_seed(0)
+    scene = load_scene(arguments.scene, DataConfig(max_side=SIDE))
+    found = scene_covariance(scene.train_views, scene.residuals)
+    if found is None:
+        print(f"{arguments.scene}: too few residuals")
+    else:
+        common = SIDE * (2 * found.common) ** 0.5
+        print(
+            f"{arguments.scene}: share in common {found.share:.3f}, {common:.2f} px within "
+            f"{SIDE * found.length:.0f} px"
+        )
     for run in arguments.runs:
         seen = observations(arguments.scene, run)
         near = np.linalg.norm(seen.residual, axis=1) < LARGEST

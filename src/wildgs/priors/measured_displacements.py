@@ -92,8 +92,8 @@ def measured_displacements(
         least_share: Displacements are zero if neighbouring residuals have less than this share of the variance in
             common.
     """
-    points = [_chosen(residuals.get(view.name, Residuals.none())) for view in views]
-    covariance = estimate_covariance(points)
+    points = _points(views, residuals)
+    covariance = _covariance(points)
     nothing = torch.zeros(len(views), 2, cells, cells)
     if covariance is None:
         return MeasuredDisplacements(nothing, 0.0)
@@ -112,8 +112,17 @@ Points = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
 """Places and offsets of residuals."""
 
 
-def estimate_covariance(photos: Sequence[Points]) -> Covariance | None:
-    """Fits covariances of residuals of the same photo by their distance; None if there are too few."""
+def scene_covariance(views: Sequence[View], residuals: Mapping[str, Residuals]) -> Covariance | None:
+    """Covariance of residuals of the same photo by their distance; None if there are too few.
+
+    Args:
+        views: The photos.
+        residuals: Residuals by the photos' names.
+    """
+    return _covariance(_points(views, residuals))
+
+
+def _covariance(photos: Sequence[Points]) -> Covariance | None:
     photos = photos[:: -(-len(photos) // MOST_PHOTOS) or 1]
     if sum(len(places) for places, _ in photos) < LEAST_POINTS:
         return None
@@ -135,6 +144,10 @@ def estimate_covariance(photos: Sequence[Points]) -> Covariance | None:
     best = int(errors.argmin())
     smooth = float(np.clip(common[best], 0, (1 - LEAST_NOISE) * variance))
     return Covariance(smooth, variance - smooth, float(LENGTHS[best]))
+
+
+def _points(views: Sequence[View], residuals: Mapping[str, Residuals]) -> list[Points]:
+    return [_chosen(residuals.get(view.name, Residuals.none())) for view in views]
 
 
 def _chosen(residuals: Residuals) -> Points:
