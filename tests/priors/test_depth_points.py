@@ -151,13 +151,13 @@ def test_far_that_is_large_is_no_disparity() -> None:
     assert fit_disparity(1 - inverse, inverse, torch.Generator().manual_seed(0)) is None
 
 
-def test_metric_depth_of_one_photo_is_enough_and_brings_its_disparity_to_scale() -> None:
+def test_metric_depth_of_two_photos_is_enough_and_brings_their_disparity_to_scale() -> None:
     depth = relief()
     metric = depth.clone()
     metric[:, SIDE // 2 :] = 0
-    points, _ = depth_points(
-        scene([with_photos(view(2, depth), disparity=None, depth=metric.numpy())]), CONFIG
-    )
+    two = [with_photos(view(index, depth), disparity=None, depth=metric.numpy()) for index in (2, 3)]
+    assert len(depth_points(scene(two[:1]), CONFIG)[0]) == 0
+    points, _ = depth_points(scene(two), CONFIG)
     assert len(points) > 100
     assert points[:, 0].max() < 0.1
     assert (points[points[:, 1] > 0.05, 2] - WALL).abs().max() < 0.02
