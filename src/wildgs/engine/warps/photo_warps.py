@@ -111,10 +111,12 @@ class PhotoWarps:
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs to continue in the same way."""
-        return {"grids": self.grids.clone()} if self.is_used else {}
+        return {"grids": self.grids.clone(), "first": self._first.clone()} if self.is_used else {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Continues from `state`; starts again if the number of photos or cells has changed."""
-        grids = state.get("grids")
+        grids, first = state.get("grids"), state.get("first")
         if grids is not None and grids.shape == self.grids.shape:
             self.grids = grids.to(self.grids.device).clone()
+            if first is not None:
+                self._first = first.to(self.grids.device).clone()
