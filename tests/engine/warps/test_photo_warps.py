@@ -261,14 +261,17 @@ def trainer_for(scene: Scene, model: WildGSConfig, steps: int, name: MethodName 
     torch.manual_seed(0)
     method = create_method(name, model if name == "wildgs" else None, scene)
     schedule = ScheduleConfig(densify_every=0)
-    warp = WarpConfig(residuals=False, cells=4, most=0.05, photos=0)
+    warp = WarpConfig(residuals=bool(scene.residuals), cells=4, most=0.05, photos=0)
     config = TrainConfig(steps=steps, precision="float32", schedule=schedule, warp=warp)
     return Trainer(method, scene, config)
 
 
+@pytest.mark.parametrize("measured", [False, True])
 def test_a_resumed_run_ends_in_the_same_bits(
-    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path
+    wall_scene: Scene, tiny_model: WildGSConfig, tmp_path: Path, measured: bool
 ) -> None:
+    if measured:
+        wall_scene = replace(wall_scene, residuals=residuals_of(wall_scene, 0.4))
     whole = trainer_for(wall_scene, tiny_model, 24)
 
     def save(report: StepReport) -> None:
