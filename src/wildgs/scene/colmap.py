@@ -45,7 +45,7 @@ class ColmapImage:
         viewmat: World-to-camera transform in the model's frame.
         median_depth: Median depth of the points that this photo observes; None without observations.
         shown: Indices of the points that SfM found in this photo.
-        pixels: Where: pixels (x, y) of the stored photo, not undistorted.
+        pixels: Where: pixels (x, y) of `camera`, not undistorted.
     """
 
     name: str

@@ -30,7 +30,7 @@ class ImagePoints:
 
     Attributes:
         point_ids: Ids of the points.
-        pixels: Pixels (x, y) of the stored photo; the centre of the upper left pixel is (0.5, 0.5).
+        pixels: Pixels (x, y) of the photo's camera; the centre of the upper left pixel is (0.5, 0.5).
     """
 
     point_ids: UInt64[np.ndarray, " K"]
