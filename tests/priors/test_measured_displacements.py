@@ -84,6 +84,13 @@ def test_too_few_residuals_say_nothing(points: int) -> None:
     assert not found.grids.any()
 
 
+def test_features_without_any_residual_displace_nothing() -> None:
+    places = torch.rand(300, 2)
+    exact = Residuals(places, torch.zeros(300, 2))
+    found = measured_displacements(views(1), {"0.jpg": exact}, CELLS, 0.0)
+    assert not found.grids.any()
+
+
 def test_features_at_one_place_are_no_obstacle() -> None:
     places = torch.full((300, 2), 0.3)
     found = measured_displacements(views(1), {"0.jpg": Residuals(places, places / SIDE)}, CELLS, 0.08)

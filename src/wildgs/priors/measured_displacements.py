@@ -97,7 +97,7 @@ def measured_displacements(
     nothing = torch.zeros(len(views), 2, cells, cells)
     if covariance is None:
         return MeasuredDisplacements(nothing, 0.0)
-    if covariance.share < least_share or not views:
+    if covariance.share < least_share or covariance.common == 0:
         return MeasuredDisplacements(nothing, covariance.share)
 
     def interpolate(row: int) -> Float[Tensor, "2 G G"]:

@@ -121,9 +121,9 @@ def read_model(root: Path) -> ColmapModel:
         raise UserError(f"{folder}: the COLMAP model has no points, which training needs; triangulate it")
     viewmats = {image.image_id: _viewmat(image) for image in registered}
     depths = _median_depths(records.points, finite, viewmats)
-    images = []
+    images, ids = [], records.points.ids[finite]
     for image in registered:
-        shown, pixels = _shown_points(image, records.points.ids[finite])
+        shown, pixels = _shown_points(image, ids)
         images.append(
             ColmapImage(
                 name=_checked_name(image.name, folder),
