@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -68,6 +69,32 @@ def test_of_two_processes_that_start_at_once_one_compiles(tmp_path: Path):
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) for _ in range(2)]
     found = sorted(process.communicate(timeout=120)[0].split() for process in both)
     assert found == [["42", "0"], ["42", "1"]]
+
+
+FORKED = """
+import os
+import kernels.kernel as made
+child = os.fork()
+if child == 0:
+    print(made.scaled(2.5), flush=True)
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_process_compiles_what_its_parent_has_not(tmp_path: Path):
+    """The parent has compiled the kernel for integers, and so has made and used its lock."""
+    package = tmp_path / "kernels"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "kernel.py").write_text(KERNEL.format(package="kernels"))
+    (package / "shared.py").write_text(SHARED.format(factor=2))
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], capture_output=True, text=True, cwd=tmp_path, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "5.0"
 
 
 def test_where_nothing_is_writable_a_temporary_folder_serves_with_one_warning(

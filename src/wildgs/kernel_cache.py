@@ -143,7 +143,15 @@ class _KernelCache(FunctionCache):
         super().__init__(function)
         name = f"{function.__qualname__}-{function.__code__.co_firstlineno}.lock"
         file = Path(self.cache_path) / "locks" / name.replace("<locals>", "")
-        self._lock = filelock.FileLock(file, timeout=LONGEST_COMPILATION)
+        self._lock_file, self._locks = file, dict[int, filelock.BaseFileLock]()
+
+    @property
+    def _lock(self) -> filelock.BaseFileLock:
+        """This process's lock; one that was made before a fork is of no use after it."""
+        process = os.getpid()
+        if process not in self._locks:
+            self._locks = {process: filelock.FileLock(self._lock_file, timeout=LONGEST_COMPILATION)}
+        return self._locks[process]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled kernel; if it is not on the disk, the lock is held until `save_overload`."""
