@@ -18,78 +18,90 @@ larger.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
+import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import map_coordinates
+from torch import Tensor
 
-import wildgs
 from wildgs.engine.checkpoint import list_checkpoints, load_checkpoint
 from wildgs.priors.measured_displacements import scene_covariance
-from wildgs.scene import DataConfig, load_scene
+from wildgs.scene import DataConfig, Scene, View, load_scene
 
 SIDE = 320
-LARGEST = 2.0
 LEAST_PHOTOS = 6
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Where photos show points.
+    """Points in photos.
 
     Attributes:
         photo: Row of the training photo.
-        point: Id of the point.
+        point: Row of the point.
         displacement: Displacement of the photo there, pixels.
-        residual: Residual of structure from motion, pixels.
         motion: Movement in the photo per movement of the point.
     """
 
     photo: Int[np.ndarray, " K"]
     point: Int[np.ndarray, " K"]
     displacement: Float[np.ndarray, "K 2"]
-    residual: Float[np.ndarray, "K 2"]
     motion: Float[np.ndarray, "K 2 3"]
 
 
-def observations(scene: Path, run: Path) -> Observations:
-    """All observations of points in the training photos of a run."""
-    names = [view.name for view in wildgs.load(run).scene.train_views]
+def read_grids(scene: Scene, run: Path) -> Float[np.ndarray, "V 2 G G"]:
+    """Displacements of the training photos at the end of a run, pixels."""
     state = load_checkpoint(list_checkpoints(run / "checkpoints")[-1]).state
     if "warps.grids" not in state:
         raise SystemExit(f"{run}: photos were not displaced")
-    grids = state["warps.grids"].numpy()
-    model = pycolmap.Reconstruction(scene / "sparse" / "0")
-    images = {image.name: image for image in model.images.values()}
-    rows = [
-        (photo, *entry)
-        for photo, name in enumerate(names)
-        for entry in _of(model, images[name], grids[photo])
+    if len(state["warps.grids"]) != len(scene.train_views):
+        raise SystemExit(f"{run} was trained on other photos than those of {scene.root}")
+    return SIDE * state["warps.grids"].numpy()
+
+
+def sampled(grid: Float[np.ndarray, "2 G G"], view: View, places: Float[Tensor, "K 2"]) -> np.ndarray:
+    """Displacements at places (x, y) in units of the photo's longer side."""
+    camera = view.camera
+    size = torch.tensor([camera.width, camera.height]) / max(camera.width, camera.height)
+    cells = (places / size * grid.shape[1] - 0.5).numpy().T[::-1]
+    return np.stack([map_coordinates(axis, cells, order=1, mode="nearest") for axis in grid], axis=1)
+
+
+def at_residuals(scene: Scene, grids: Float[np.ndarray, "V 2 G G"]) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements and residuals of all observations with a residual, pixels."""
+    found = [
+        (sampled(grid, view, residuals.places), SIDE * residuals.offsets.numpy())
+        for view, grid in zip(scene.train_views, grids, strict=True)
+        if len((residuals := scene.residuals[view.name]).places)
     ]
-    return Observations(*(np.array(column) for column in zip(*rows, strict=True)))
+    moved, measured = (np.concatenate(part) for part in zip(*found, strict=True))
+    return moved, measured
 
 
-def _of(
-    model: pycolmap.Reconstruction, image: pycolmap.Image, grid: Float[np.ndarray, "2 G G"]
-) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-    camera, pose = model.cameras[image.camera_id], image.cam_from_world()
-    scale = SIDE / max(camera.width, camera.height)
-    for seen in image.points2D:
-        if not seen.has_point3D():
+def observations(scene: Scene, grids: Float[np.ndarray, "V 2 G G"]) -> Observations:
+    """All points that training photos observe, inside the photos."""
+    rows = {view.name: row for row, view in enumerate(scene.train_views)}
+    parts = []
+    for number, view in enumerate(scene.views):
+        points = scene.observations[scene.observations[:, 0] == number, 1].long()
+        pixels, depth = view.camera.project(scene.points[points])
+        size = torch.tensor([view.camera.width, view.camera.height])
+        inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+        if view.name not in rows or not inside.any():
             continue
-        x, y, z = place = pose * model.points3D[seen.point3D_id].xyz
-        pixel = camera.img_from_cam(place) if z > 0 else None
-        if pixel is None or not (0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height):
-            continue
-        cell = pixel / (camera.width, camera.height) * grid.shape[1] - 0.5
-        found = [map_coordinates(axis, cell[::-1, None], order=1, mode="nearest")[0] for axis in grid]
-        projection = np.array([[1, 0, -x / z], [0, 1, -y / z]]) * camera.mean_focal_length() / z
-        motion = scale * projection @ pose.rotation.matrix()
-        yield seen.point3D_id, SIDE * np.array(found), scale * (seen.xy - pixel), motion
+        points, pixels, depth = points[inside], pixels[inside], depth[inside]
+        side, row = max(view.camera.width, view.camera.height), rows[view.name]
+        x, y = ((pixels - view.camera.K[:2, 2]) / view.camera.K.diagonal()[:2]).unbind(dim=1)
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        slopes = torch.stack([one, zero, -x, zero, one, -y], dim=1).view(-1, 2, 3)
+        scale = SIDE / side * view.camera.K.diagonal()[:2, None] / depth[:, None, None]
+        motion = scale * slopes @ view.camera.viewmat[:3, :3]
+        displacement = sampled(grids[row], view, pixels / side)
+        parts.append((np.full(len(points), row), points.numpy(), displacement, motion.numpy()))
+    return Observations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def explained(seen: Observations, displacement: Float[np.ndarray, "K 2"]) -> float:
@@ -121,10 +133,10 @@ def main() -> None:
             f"{SIDE * found.length:.0f} px"
         )
     for run in arguments.runs:
-        seen = observations(arguments.scene, run)
-        near = np.linalg.norm(seen.residual, axis=1) < LARGEST
-        moved, measured = seen.displacement[near], seen.residual[near]
+        grids = read_grids(scene, run)
+        moved, measured = at_residuals(scene, grids)
         rms = [np.sqrt((values**2).sum(axis=1).mean()) for values in (moved, measured)]
+        seen = observations(scene, grids)
         signs = np.random.default_rng(0).choice([-1, 1], seen.photo.max() + 1)[seen.photo]
         print(
             f"{run}: {len(moved):,} observations, displacements {rms[0]:.2f} px, residuals {rms[1]:.2f} px, "

@@ -43,12 +43,18 @@ def run(folder: Path) -> list[int]:
     return [int(value) for value in done.stdout.split()]
 
 
-def test_an_edit_of_a_file_that_a_kernel_calls_is_noticed(tmp_path: Path):
-    package = tmp_path / "kernels"
+def write_package(folder: Path, kernel: str = KERNEL) -> Path:
+    """A package `kernels` of a kernel that calls another file's function."""
+    package = folder / "kernels"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    (package / "kernel.py").write_text(KERNEL.format(package="kernels"))
+    (package / "kernel.py").write_text(kernel.format(package="kernels"))
     (package / "shared.py").write_text(SHARED.format(factor=2))
+    return package
+
+
+def test_an_edit_of_a_file_that_a_kernel_calls_is_noticed(tmp_path: Path):
+    package = write_package(tmp_path)
     assert run(tmp_path) == [42, 0]
     assert run(tmp_path) == [42, 1]
     (package / "shared.py").write_text(SHARED.format(factor=3))
@@ -56,15 +62,8 @@ def test_an_edit_of_a_file_that_a_kernel_calls_is_noticed(tmp_path: Path):
 
 
 def test_of_two_processes_that_start_at_once_one_compiles(tmp_path: Path):
-    package = tmp_path / "kernels"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    waiting = "import time\nwhile time.time() < {start}:\n    pass\n"
-    body = KERNEL.format(package="kernels").replace(
-        "print(", waiting.format(start="float(sys.argv[1])") + "print(", 1
-    )
-    (package / "kernel.py").write_text(body)
-    (package / "shared.py").write_text(SHARED.format(factor=2))
+    waiting = "import time\nwhile time.time() < float(sys.argv[1]):\n    pass\n"
+    write_package(tmp_path, KERNEL.replace("print(", waiting + "print(", 1))
     command = [sys.executable, "-W", "error", "-c", "import kernels.kernel", str(time.time() + 6)]
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) for _ in range(2)]
     found = sorted(process.communicate(timeout=120)[0].split() for process in both)
@@ -85,11 +84,7 @@ assert os.waitpid(child, 0)[1] == 0
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_a_forked_process_compiles_what_its_parent_has_not(tmp_path: Path):
     """The parent has compiled the kernel for integers, and so has made and used its lock."""
-    package = tmp_path / "kernels"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    (package / "kernel.py").write_text(KERNEL.format(package="kernels"))
-    (package / "shared.py").write_text(SHARED.format(factor=2))
+    write_package(tmp_path)
     done = subprocess.run(
         [sys.executable, "-c", FORKED], capture_output=True, text=True, cwd=tmp_path, timeout=120
     )

@@ -159,7 +159,7 @@ class FlatGroundConfig:
 
 @dataclass(frozen=True)
 class WarpConfig:
-    """Training photos are displaced to where they fit renders (`wildgs.engine.warps`). Not in the paper.
+    """Training photos are displaced to where residuals of SfM and renders show them. Not in the paper.
 
     Attributes:
         residuals: Begin from, and return to, displacements that residuals of structure from motion show. Photos

@@ -94,11 +94,9 @@ def measured_displacements(
     """
     points = _points(views, residuals)
     covariance = _covariance(points)
-    nothing = torch.zeros(len(views), 2, cells, cells)
-    if covariance is None:
-        return MeasuredDisplacements(nothing, 0.0)
-    if covariance.share < least_share or covariance.common == 0:
-        return MeasuredDisplacements(nothing, covariance.share)
+    if covariance is None or covariance.share < least_share or covariance.common == 0:
+        share = 0.0 if covariance is None else covariance.share
+        return MeasuredDisplacements(torch.zeros(len(views), 2, cells, cells), share)
 
     def interpolate(row: int) -> Float[Tensor, "2 G G"]:
         camera = views[row].camera
@@ -162,10 +160,10 @@ def _kriged(
     points: Points, covariance: Covariance, cells: int, width: int, height: int
 ) -> Float[Tensor, "2 G G"]:
     places, offsets = points
-    steps = (np.arange(cells) + 0.5) / cells
-    x, y = np.meshgrid(steps * width / max(width, height), steps * height / max(width, height))
     if not len(places):
         return torch.zeros(2, cells, cells)
+    steps = (np.arange(cells) + 0.5) / cells
+    x, y = np.meshgrid(steps * width / max(width, height), steps * height / max(width, height))
     among = covariance.at(cdist(places, places, "sqeuclidean")) + covariance.noise * np.eye(len(places))
     to_cells = covariance.at(cdist(np.stack([x.ravel(), y.ravel()], axis=1), places, "sqeuclidean"))
     found = to_cells @ solve(among, offsets, assume_a="pos")

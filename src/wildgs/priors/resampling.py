@@ -25,8 +25,9 @@ def warp(photo: Float[Tensor, "H W 3"], grid: Float[Tensor, "2 G G"]) -> Float[T
         return sampled(photo, max(height, width) * interpolated(grid, height, width))
     rows = interpolation(grid.shape[1], height, grid.device)
     shifts = (max(height, width) * (rows @ grid)).transpose(0, 1).contiguous()
+    photo = photo.contiguous()
     warped, (cells, weights) = torch.empty_like(photo), between(grid.shape[2], width)
-    arrays = (tensor.numpy() for tensor in (photo.contiguous(), shifts, cells, weights, warped))
+    arrays = (tensor.numpy() for tensor in (photo, shifts, cells, weights, warped))
     launch(warp_rows, *arrays, items=-(-height // ROWS))
     return warped
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -281,6 +281,22 @@ def test_a_resumed_run_ends_in_the_same_bits(
 
     whole.run([save])
     assert differences_after_resuming(whole, tmp_path, wall_scene, tiny_model) == []
+
+
+def test_all_ranks_begin_with_the_same_displacements(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    """Those of rank 0, since other ranks may have another library of linear algebra."""
+    shared: list[Tensor] = []
+
+    class FirstRank(Team):
+        def share(self, tensors: Iterable[Tensor]) -> None:
+            shared.extend(tensors)
+
+    trainer = trainer_for(replace(wall_scene, residuals=residuals_of(wall_scene, 0.4)), tiny_model, 2)
+    trainer.team = FirstRank()
+    trainer.begin()
+    trainer.end()
+    assert trainer.warps.grids.any()
+    assert sum(any(tensor is other for other in shared) for tensor in trainer.warps.tensors()) == 2
 
 
 def test_baselines_train_on_photos_as_they_are(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
