@@ -40,6 +40,21 @@ def test_shell_lies_beyond_the_points() -> None:
     assert {name: len(values) for name, values in rows.items()} == dict.fromkeys(rows, 200)
 
 
+def test_no_camera_is_outside_the_shell() -> None:
+    """A photo from far away, with a long lens, would show the sky in front of the scene."""
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    far = torch.tensor([[0.0, -20.0, 1.0], [1.0, 0.0, 0.0]])
+    distances = sky_rows(SkyConfig(points=200), points, far)["means"].norm(dim=1)
+    assert float(distances.min()) > 25
+    wrong = torch.tensor([[0.0, -1e6, 1.0]])
+    assert float(sky_rows(SkyConfig(points=200), points, wrong)["means"].norm(dim=1).max()) < 110
+    near = far[1:]
+    assert torch.equal(
+        sky_rows(SkyConfig(points=200), points, near)["means"],
+        sky_rows(SkyConfig(points=200), points)["means"],
+    )
+
+
 def test_sky_covers_what_a_camera_sees_above_the_horizon() -> None:
     """Neighbours overlap: no direction of the sky is further than two standard deviations from a Gaussian."""
     rows = sky_rows(SkyConfig(), torch.zeros(10, 3))

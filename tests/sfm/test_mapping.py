@@ -25,16 +25,25 @@ class FakeModel:
 
 
 @pytest.mark.parametrize(
-    ("runs", "best", "tried"),
+    ("runs", "agreeing", "few", "best", "tried"),
     [
-        ([["a", "b", "c"]], 0, 1),  # all photos have a pose
-        ([["a"], ["a", "b", "c"]], 1, 2),
-        ([["a"], ["a", "b"], []], 1, 3),
-        ([[], ["a"], []], 1, 3),
+        ([["a", "b", "c"]], 0.6, False, 0, 1),  # all photos have a pose
+        ([["a"], ["a", "b", "c"]], 0.6, False, 1, 2),
+        ([["a"], ["a", "b"], []], 0.6, False, 1, 3),
+        ([[], ["a"], []], 0.6, False, 1, 3),
+        ([["a", "b", "c"]], 0.8, True, 0, 1),  # and most matches agree
+        ([["a", "b"], ["a", "b", "c"], ["a"], []], 0.6, True, 1, 4),
+        ([[], [], [], []], 0.6, True, None, 4),
     ],
 )
 def test_mapping_is_repeated_while_photos_are_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runs: list[list[str]], best: int, tried: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    runs: list[list[str]],
+    agreeing: float,
+    few: bool,
+    best: int | None,
+    tried: int,
 ) -> None:
     copies = [WorkingCopy(f"{name}.jpg", name, f"{name}.jpg", False) for name in "abc"]
     seeds = []
@@ -48,6 +57,23 @@ def test_mapping_is_repeated_while_photos_are_missing(
         return [FakeModel(names, 100 * len(names))] if names else []
 
     monkeypatch.setattr(mapping, "map_photos", run)
+    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (int(1000 * agreeing), 1000))
+    monkeypatch.setattr(mapping, "FEW", 3 if few else 2)
+    monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 4)
     models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(seed=5), silent)
-    assert models[0].names == runs[best]
-    assert seeds == [5, 6, 7][:tried]
+    assert [model.names for model in models] == ([] if best is None else [runs[best]])
+    assert seeds == [5, 6, 7, 8][:tried]
+
+
+@pytest.mark.parametrize(("agreeing", "best"), [((400, 500), 1), ((0, 0), 0)])
+def test_matches_that_agree_outweigh_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: tuple[int, int], best: int
+) -> None:
+    """The first run has more observations of points than the second."""
+    copies = [WorkingCopy("a.jpg", "a", "a.jpg", False)]
+    models, counts = iter([FakeModel(["a"], 900), FakeModel(["a"], 800)]), iter(agreeing)
+    monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 2)
+    monkeypatch.setattr(mapping, "map_photos", lambda *_, **__: [next(models)])
+    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (next(counts), 1000))
+    found = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    assert found[0].observations == (900, 800)[best]

@@ -95,7 +95,10 @@ def initial_gaussians(
     plane = _ground_below(cameras, sparse[0], points, wanted_ground)
     ground = ground_points(points, colors, plane, cameras, wanted_ground)
     names = [view.name for view in scene.train_views]
-    return initial_from_points(replace(config, sky=sky), *sparse, dense=dense, ground=ground, photos=names)
+    positions = torch.stack([view.camera.position for view in scene.views]) if scene.views else None
+    return initial_from_points(
+        replace(config, sky=sky), *sparse, dense=dense, ground=ground, cameras=positions, photos=names
+    )
 
 
 def _ground_below(
@@ -118,6 +121,7 @@ def initial_from_points(
     *,
     dense: ColoredPoints | None = None,
     ground: GroundPoints | None = None,
+    cameras: Float[Tensor, "V 3"] | None = None,
     photos: Sequence[str] = (),
 ) -> InitialGaussians:
     """Creates initial Gaussians from given points, and the sky.
@@ -128,6 +132,7 @@ def initial_from_points(
         colors: Their colours.
         dense: Further points from depth maps.
         ground: Points that extend the ground plane.
+        cameras: Positions of all photos' cameras, around which the sky is.
         photos: Names of the training photos.
     """
     surface, surface_colors = points, colors
@@ -137,7 +142,7 @@ def initial_from_points(
     if ground is not None:
         parts.append((ground_rows(ground.points, ground.spacing), ground.colors.float() / 255))
     if config.sky.points:
-        parts.append((sky_rows(config.sky, points), torch.full((config.sky.points, 3), SKY_COLOR)))
+        parts.append((sky_rows(config.sky, points, cameras), torch.full((config.sky.points, 3), SKY_COLOR)))
     return InitialGaussians(
         rows={name: torch.cat([rows[name] for rows, _ in parts]) for name in parts[0][0]},
         colors=torch.cat([unit for _, unit in parts]),
@@ -164,9 +169,11 @@ def ground_rows(points: Float[Tensor, "G 3"], spacing: Float[Tensor, " G"]) -> d
     }
 
 
-def sky_rows(config: SkyConfig, points: Float[Tensor, "P 3"]) -> dict[str, Tensor]:
+def sky_rows(
+    config: SkyConfig, points: Float[Tensor, "P 3"], cameras: Float[Tensor, "V 3"] | None = None
+) -> dict[str, Tensor]:
     """Geometry of the sky's Gaussians: isotropic, as large as their spacing, around the scene's SfM points."""
-    rows = geometry_from_points(sky_points(config, points))
+    rows = geometry_from_points(sky_points(config, points, cameras))
     rows["opacity_logits"] = torch.full((config.points,), config.opacity).logit()
     return rows
 

@@ -21,6 +21,10 @@ COLOR = 0.75
 SKY_SHARE = 0.4
 """Rendered depth of the free sky, at least, as a fraction of the sphere's radius."""
 
+CAMERA_MARGIN, FARTHEST = 1.5, 10.0
+"""Smallest radius of the sphere as a multiple of the distance of the farthest camera, up to this multiple of the
+configured one: a camera even farther away has a wrong pose."""
+
 
 @dataclass(frozen=True)
 class Sky:
@@ -72,17 +76,25 @@ def sky_directions(
     return functional.normalize(points - centre, dim=-1)
 
 
-def sky_points(config: SkyConfig, points: Float[Tensor, "P 3"]) -> Float[Tensor, "S 3"]:
-    """Centres of the sky's Gaussians.
+def sky_points(
+    config: SkyConfig, points: Float[Tensor, "P 3"], cameras: Float[Tensor, "V 3"] | None = None
+) -> Float[Tensor, "S 3"]:
+    """Centres of the sky's Gaussians, on a sphere that contains the cameras.
+
+    A camera outside would see the sky in front of the scene.
 
     Args:
         config: Configuration of the sphere.
         points: SfM points in the aligned frame.
+        cameras: Positions of the photos' cameras.
     """
     centre = points.median(dim=0).values
     distances = (points - centre).norm(dim=1).sort().values
     reach = float(distances[round(0.98 * (len(distances) - 1))])
     radius = max(config.radius, config.reach * reach)
+    if cameras is not None and len(cameras):
+        farthest = float((cameras - centre).norm(dim=1).max())
+        radius = max(radius, min(CAMERA_MARGIN * farthest, FARTHEST * config.radius))
     return centre + radius * shell_directions(config.points, config.lowest)
 
 

@@ -8,20 +8,23 @@ visual relations using loop constraints", CVPR 2010.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Shaped
+from jaxtyping import Bool, Float64, Shaped
 
 LEAST_MATCHES = 30
 """Smallest number of matches of a pair to be considered; fewer are often wrong by chance."""
 
 MAX_ERROR = 0.01
 """Largest distance from the epipolar line of a match that agrees, relative to the longer side."""
+
+EXACT_ERROR = 0.002
+"""The same for matches that count for a model (`count_agreeing`): one pixel of 500."""
 
 AGREEING_SHARE = 0.5
 """Smallest fraction of a pair's matches that must agree with the poses."""
@@ -37,21 +40,42 @@ def find_doubtful(model: Any, database_file: Path, names: Mapping[str, str]) -> 
     """
     agreeing: dict[str, int] = {}
     contradicting: dict[str, dict[str, int]] = {}
+    for first, second, matches in _verified(model, database_file):
+        share = float(agreeing_matches(first, second, matches, MAX_ERROR).mean())
+        for image, other in ((first, second), (second, first)):
+            if share >= AGREEING_SHARE:
+                agreeing[image.name] = agreeing.get(image.name, 0) + len(matches)
+            else:
+                contradicting.setdefault(image.name, {})[other.name] = len(matches)
+    return _judge(agreeing, contradicting, names)
+
+
+def count_agreeing(model: Any, database_file: Path) -> tuple[int, int]:
+    """Number of verified matches of registered photos that agree closely with the poses, and of all of them.
+
+    They judge models of the same photos better than their points do: of few photos, a model that is too deep or has
+    near and far reversed may have as many points with as small errors, since it leaves out what contradicts it.
+
+    Args:
+        model: pycolmap's reconstruction.
+        database_file: Database with the verified matches.
+    """
+    agreeing = [
+        agreeing_matches(first, second, matches, EXACT_ERROR)
+        for first, second, matches in _verified(model, database_file)
+    ]
+    return sum(int(mask.sum()) for mask in agreeing), sum(len(mask) for mask in agreeing)
+
+
+def _verified(model: Any, database_file: Path) -> Iterator[tuple[Any, Any, Shaped[np.ndarray, "M 2"]]]:
+    """Pairs of registered photos with enough verified matches, and these."""
     registered = set(model.reg_image_ids())
     with closing(pycolmap.Database.open(database_file)) as database:
         for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            if inliers < LEAST_MATCHES or first not in registered or second not in registered:
-                continue
-            matches = database.read_two_view_geometry(first, second).inlier_matches
-            share = agreeing_share(model.image(first), model.image(second), matches)
-            pair = model.image(first).name, model.image(second).name
-            for name, other in (pair, pair[::-1]):
-                if share >= AGREEING_SHARE:
-                    agreeing[name] = agreeing.get(name, 0) + int(inliers)
-                else:
-                    contradicting.setdefault(name, {})[other] = int(inliers)
-    return _judge(agreeing, contradicting, names)
+            if inliers >= LEAST_MATCHES and first in registered and second in registered:
+                matches = database.read_two_view_geometry(first, second).inlier_matches
+                yield model.image(first), model.image(second), matches
 
 
 def _judge(
@@ -69,8 +93,17 @@ def _judge(
     return doubtful
 
 
-def agreeing_share(first: Any, second: Any, matches: Shaped[np.ndarray, "M 2"]) -> float:
-    """Fraction of the matches of two images that agree with the epipolar geometry of their poses in both images."""
+def agreeing_matches(
+    first: Any, second: Any, matches: Shaped[np.ndarray, "M 2"], max_error: float
+) -> Bool[np.ndarray, " M"]:
+    """Mask of the matches of two images that agree with the epipolar geometry of their poses in both images.
+
+    Args:
+        first: pycolmap's image.
+        second: The other one.
+        matches: Pairs of their keypoints.
+        max_error: Largest distance from the epipolar line, relative to the longer side.
+    """
     places = [_keypoints(image)[matches[:, side]] for side, image in enumerate((first, second))]
     rays = [_unproject(image.camera, points) for image, points in zip((first, second), places, strict=True)]
     relative = second.cam_from_world() * first.cam_from_world().inverse()
@@ -80,9 +113,9 @@ def agreeing_share(first: Any, second: Any, matches: Shaped[np.ndarray, "M 2"]) 
     fits = np.ones(len(matches), dtype=bool)
     for image, line in zip((second, first), lines, strict=True):
         camera = image.camera
-        allowed = MAX_ERROR * max(camera.width, camera.height) / camera.mean_focal_length()
+        allowed = max_error * max(camera.width, camera.height) / camera.mean_focal_length()
         fits &= residual <= allowed * np.linalg.norm(line[:, :2], axis=1)
-    return float(fits.mean())
+    return fits
 
 
 def _keypoints(image: Any) -> Float64[np.ndarray, "N 2"]:

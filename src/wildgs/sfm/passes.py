@@ -22,6 +22,7 @@ from wildgs.sfm.mapping import (
     continue_mapping,
     map_photos,
     map_repeatedly,
+    measure_distortion,
     missing_from,
 )
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs
@@ -85,6 +86,7 @@ def find_poses(
         pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
     if not models:
         return None
+    measure_distortion(work, models[0], len(copies))
     lenses = drop_impossible(models[0])
     if lenses and config.second_chance:
         models[0] = place_with_plain_lens(
