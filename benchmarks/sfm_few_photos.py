@@ -35,6 +35,9 @@ from wildgs.sfm.config import SfmConfig
 NEAR = 1.5
 """Largest distance between keypoints of the two models that are taken for the same, pixels."""
 
+LEAST_COMMON = 20
+"""Smallest number of points in common for a comparison."""
+
 
 @dataclass(frozen=True)
 class Command:
@@ -116,6 +119,8 @@ def common_points(truth: Any, found: Any) -> tuple[np.ndarray, np.ndarray]:
         distances = np.linalg.norm(scaled[:, None] - our_places[None], axis=2)
         rows = np.flatnonzero(distances.min(axis=1) < NEAR)
         pairs.append((points[rows], our_points[distances[rows].argmin(axis=1)]))
+    if not pairs:
+        return np.zeros((0, 3)), np.zeros((0, 3))
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
 
 
@@ -135,9 +140,13 @@ def fit(source: np.ndarray, target: np.ndarray) -> Any:
     return pycolmap.estimate_sim3d(source[inliers], target[inliers])
 
 
-def compare(truth: Any, found: Any) -> Score:
-    """Compares two models."""
-    similarity = fit(*common_points(truth, found))
+def compare(truth: Any, found: Any) -> Score | None:
+    """Compares two models; None if they have hardly any points in common."""
+    common = common_points(truth, found)
+    if len(common[0]) < LEAST_COMMON:
+        print(f"only {len(common[0])} points in common")
+        return None
+    similarity = fit(*common)
     errors, focals = [], []
     for image, other in common_photos(truth, found):
         places, points = seen(truth, image)

@@ -11,11 +11,13 @@ import pytest
 
 from wildgs.sfm import lens_priors
 from wildgs.sfm.lens_priors import (
-    CORNER_SHIFT,
     FOCAL_SPREAD,
     KNOWN_FOCAL_SPREAD,
+    USUAL_SHIFT,
+    WIDE_SHIFT,
     LensPrior,
     adjust_with_priors,
+    corner_shifts,
 )
 
 WIDTH, HEIGHT = 640, 480
@@ -66,12 +68,6 @@ def focals(model: Any) -> np.ndarray:
     return np.array([lens.mean_focal_length() / WIDTH for lens in model.cameras.values()])
 
 
-def shifts(model: Any) -> np.ndarray:
-    """Displacement of the corners by distortion, relative to their distance from the centre."""
-    corner = math.hypot(WIDTH, HEIGHT) / 2
-    return np.array([lens.params[3] * (corner / lens.params[0]) ** 2 for lens in model.cameras.values()])
-
-
 def usual(model: Any) -> dict[int, LensPrior]:
     return {number: LensPrior.of(lens) for number, lens in model.cameras.items()}
 
@@ -84,7 +80,7 @@ def test_prior_is_exif_or_usual() -> None:
 @pytest.mark.parametrize("focal", [0.6, 1.0, 4.0])
 def test_photos_outweigh_the_prior_if_they_determine_lenses(focal: float) -> None:
     model = photographed(focal, spread=3.0)
-    adjust_with_priors(model, usual(model), distortion=True)
+    adjust_with_priors(model, usual(model), corner_shift=USUAL_SHIFT)
     assert np.abs(np.log(focals(model) / focal)).max() < 0.1
 
 
@@ -93,8 +89,8 @@ def test_distortion_is_measured_if_photos_determine_it() -> None:
     model = photographed(1.0, spread=3.0, radial=-0.1 / corner**2)
     for lens in model.cameras.values():
         lens.params = [*lens.params[:3], 0.0]
-    adjust_with_priors(model, usual(model), distortion=True)
-    assert np.median(shifts(model)) == pytest.approx(-0.1, abs=0.02)
+    adjust_with_priors(model, usual(model), corner_shift=WIDE_SHIFT)
+    assert np.median(corner_shifts(model)) == pytest.approx(-0.1, abs=0.02)
 
 
 def test_priors_hold_lenses_that_photos_do_not_determine() -> None:
@@ -102,8 +98,8 @@ def test_priors_hold_lenses_that_photos_do_not_determine() -> None:
     model = photographed(1.0, spread=0.3, deep=0.02, noise=1.0)
     loose = pycolmap.Reconstruction(model)
     wide = {number: LensPrior(prior.focal, 100.0) for number, prior in usual(model).items()}
-    adjust_with_priors(loose, wide, distortion=False, rounds=8)
-    adjust_with_priors(model, usual(model), distortion=False, rounds=8)
+    adjust_with_priors(loose, wide, corner_shift=None, rounds=8)
+    adjust_with_priors(model, usual(model), corner_shift=None, rounds=8)
     held, left = (abs(float(np.log(focals(each)).mean())) for each in (model, loose))
     assert held < 0.2
     assert left > 0.5
@@ -112,7 +108,7 @@ def test_priors_hold_lenses_that_photos_do_not_determine() -> None:
 def test_adjustment_keeps_the_model_but_for_numbers() -> None:
     model = photographed(1.0, spread=3.0)
     before = model.num_images(), model.num_cameras(), model.num_points3D(), model.compute_num_observations()
-    adjust_with_priors(model, usual(model), distortion=True)
+    adjust_with_priors(model, usual(model), corner_shift=USUAL_SHIFT)
     after = model.num_images(), model.num_cameras(), model.num_points3D(), model.compute_num_observations()
     assert after == before
     assert model.compute_mean_reprojection_error() < 1.0
@@ -120,14 +116,14 @@ def test_adjustment_keeps_the_model_but_for_numbers() -> None:
 
 def test_distortion_stays_unless_asked() -> None:
     model = photographed(1.0, spread=3.0, radial=0.05)
-    adjust_with_priors(model, usual(model), distortion=False)
+    adjust_with_priors(model, usual(model), corner_shift=None)
     assert [lens.params[3] for lens in model.cameras.values()] == [0.05] * 6
 
 
 def test_constant_lenses_stay() -> None:
     model = photographed(1.0, spread=3.0)
     model.camera(2).params = [700.0, WIDTH / 2, HEIGHT / 2, 0.01]
-    adjust_with_priors(model, usual(model), distortion=True, constant=[2])
+    adjust_with_priors(model, usual(model), corner_shift=USUAL_SHIFT, constant=[2])
     assert list(model.camera(2).params) == [700.0, WIDTH / 2, HEIGHT / 2, 0.01]
     assert focals(model)[0] != 1.0
 
@@ -136,17 +132,17 @@ def test_an_unusable_solution_changes_nothing() -> None:
     model = photographed(1.0, spread=3.0)
     model.point3D(1).xyz = np.full(3, np.nan)
     before = focals(model)
-    adjust_with_priors(model, usual(model), distortion=True)
+    adjust_with_priors(model, usual(model), corner_shift=USUAL_SHIFT)
     assert (focals(model) == before).all()
 
 
-def only_priors(lens: Any, *, distortion: bool) -> tuple[Any, Any]:
+def only_priors(lens: Any, *, corner_shift: float | None) -> tuple[Any, Any]:
     """A model of a lens that no photo shows, and the problem of its pseudo-observations."""
     model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
     model.add_camera_with_trivial_rig(lens)
     pseudo = lens_priors._PseudoObservations(model, config)
-    if distortion:
-        pseudo.observe_distortion(model.camera(1))
+    if corner_shift is not None:
+        pseudo.observe_distortion(model.camera(1), corner_shift)
     else:
         pseudo.observe_focal_length(model.camera(1), LensPrior.of(camera(1.0)))
     return model, config
@@ -171,7 +167,7 @@ def squared_residuals(model: Any) -> float:
 def test_focal_prior_alone_leads_to_its_median(focal: float) -> None:
     lens = camera(focal)
     for _ in range(20):
-        model, config = only_priors(lens, distortion=False)
+        model, config = only_priors(lens, corner_shift=None)
         solve(model, config)
         lens = camera(max(model.camera(1).mean_focal_length() / WIDTH, 0.05))
     assert lens.mean_focal_length() / WIDTH == pytest.approx(1.2, rel=5e-3)
@@ -180,13 +176,13 @@ def test_focal_prior_alone_leads_to_its_median(focal: float) -> None:
 def test_distortion_prior_has_its_width() -> None:
     """A displacement of the corners by one standard deviation costs as much as a residual of `RESIDUAL`."""
     corner = math.hypot(WIDTH, HEIGHT) / 2 / (1.3 * WIDTH)
-    for shift in (-CORNER_SHIFT, CORNER_SHIFT):
-        model, config = only_priors(camera(1.3), distortion=True)
+    for shift in (-USUAL_SHIFT, USUAL_SHIFT):
+        model, config = only_priors(camera(1.3), corner_shift=USUAL_SHIFT)
         model.camera(1).params = [1.3 * WIDTH, WIDTH / 2, HEIGHT / 2, shift / corner**2]
         config.set_constant_cam_intrinsics(1)
         solve(model, config)
         assert squared_residuals(model) == pytest.approx(lens_priors.RESIDUAL**2, rel=0.1)
-    model, config = only_priors(camera(1.3), distortion=True)
+    model, config = only_priors(camera(1.3), corner_shift=USUAL_SHIFT)
     model.camera(1).params = [1.5 * WIDTH, WIDTH / 2, HEIGHT / 2, 0.0]  # the distance takes the focal length
     config.set_constant_cam_intrinsics(1)
     solve(model, config)

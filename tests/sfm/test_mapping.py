@@ -27,11 +27,11 @@ class FakeModel:
 @pytest.mark.parametrize(
     ("runs", "agreeing", "few", "best", "tried"),
     [
-        ([["a", "b", "c"]], 0.6, False, 0, 1),  # all photos have a pose
+        ([["a", "b", "c"], ["a"]], 0.6, False, 0, 2),  # all photos have a pose
         ([["a"], ["a", "b", "c"]], 0.6, False, 1, 2),
         ([["a"], ["a", "b"], []], 0.6, False, 1, 3),
         ([[], ["a"], []], 0.6, False, 1, 3),
-        ([["a", "b", "c"]], 0.8, True, 0, 1),  # and most matches agree
+        ([["a", "b", "c"], ["a"]], 0.8, True, 0, 2),  # and most matches agree
         ([["a", "b"], ["a", "b", "c"], ["a"], []], 0.6, True, 1, 4),
         ([[], [], [], []], 0.6, True, None, 4),
     ],
@@ -49,9 +49,10 @@ def test_mapping_is_repeated_while_photos_are_missing(
     seeds = []
 
     def run(
-        work: Workplace, count: int, config: SfmConfig, progress: object, only: Sequence[str]
+        work: Workplace, count: int, config: SfmConfig, progress: object, only: Sequence[str], *, wide: bool
     ) -> list[FakeModel]:
         assert list(only) == []
+        assert wide == (len(seeds) % 3 == 1)
         names = runs[len(seeds)]
         seeds.append(config.seed)
         return [FakeModel(names, 100 * len(names))] if names else []

@@ -36,9 +36,9 @@ deviation of its logarithm. The photos of three collections have medians of 0.91
 KNOWN_FOCAL_SPREAD = 0.2
 """Standard deviation of the logarithm of a focal length from EXIF data; photos may be cropped."""
 
-CORNER_SHIFT = 0.02
-"""Standard deviation of the displacement of a photo's corners by distortion, relative to their distance from the
-centre."""
+USUAL_SHIFT, WIDE_SHIFT = 0.02, 0.15
+"""Standard deviations of the displacement of a photo's corners by distortion, relative to their distance from the
+centre: of usual photos, and of action cameras and fisheye lenses."""
 
 ROUNDS, CONVERGED = 3, 0.01
 """Upper bound on rounds, and largest change of a focal length's logarithm in the last one."""
@@ -75,7 +75,7 @@ def adjust_with_priors(
     model: Any,
     priors: Mapping[int, LensPrior],
     *,
-    distortion: bool,
+    corner_shift: float | None,
     constant: Collection[int] = (),
     rounds: int = ROUNDS,
 ) -> None:
@@ -84,7 +84,8 @@ def adjust_with_priors(
     Args:
         model: pycolmap's reconstruction with two registered photos or more.
         priors: Priors by camera id.
-        distortion: Whether distortion is estimated as well; it stays as it is otherwise.
+        corner_shift: Prior standard deviation of the displacement of a photo's corners by distortion, relative to
+            their distance from the centre. None keeps distortion as it is.
         constant: Ids of cameras whose lenses stay as they are.
         rounds: Upper bound on the number of bundle adjustments.
     """
@@ -93,7 +94,7 @@ def adjust_with_priors(
     trial = pycolmap.Reconstruction(model)
     for _ in range(rounds):
         before = {lens: trial.camera(lens).mean_focal_length() for lens in lenses}
-        if not _adjust(trial, photos, lenses, priors, constant, distortion):
+        if not _adjust(trial, photos, lenses, priors, constant, corner_shift):
             return
         changes = [abs(math.log(trial.camera(lens).mean_focal_length() / before[lens])) for lens in lenses]
         if max(changes, default=0.0) < CONVERGED:
@@ -107,7 +108,7 @@ def _adjust(
     lenses: Sequence[int],
     priors: Mapping[int, LensPrior],
     constant: Collection[int],
-    distortion: bool,
+    corner_shift: float | None,
 ) -> bool:
     """One bundle adjustment with pseudo-observations; returns whether its solution is usable."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -119,17 +120,27 @@ def _adjust(
     for lens in lenses:
         camera = trial.camera(lens)
         pseudo.observe_focal_length(camera, priors[lens])
-        if distortion and camera.model_name == "SIMPLE_RADIAL":
-            pseudo.observe_distortion(camera)
+        if corner_shift is not None and camera.model_name == "SIMPLE_RADIAL":
+            pseudo.observe_distortion(camera, corner_shift)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_extra_params = distortion
+    options.refine_extra_params = corner_shift is not None
     options.ceres.solver_options.max_num_iterations = ITERATIONS
     summary = pycolmap.create_default_bundle_adjuster(options, config, trial).solve()
     pseudo.remove()
     lengths = [trial.camera(lens).mean_focal_length() for lens in lenses]
     return bool(summary.is_solution_usable()) and all(math.isfinite(f) and f > 0 for f in lengths)
+
+
+def corner_shifts(model: Any) -> list[float]:
+    """Displacement of each registered photo's corners by distortion, relative to their distance from the centre."""
+    shifts = []
+    for photo in model.reg_image_ids():
+        camera = model.image(photo).camera
+        corner = math.hypot(camera.width, camera.height) / 2 / camera.mean_focal_length()
+        shifts.append(float(camera.params[3]) * corner**2 if camera.model_name == "SIMPLE_RADIAL" else 0.0)
+    return shifts
 
 
 class _PseudoObservations:
@@ -149,14 +160,14 @@ class _PseudoObservations:
         points = np.array([[tangent / math.sqrt(2), 0.0]])
         self._add(camera, points, points * target, copies=2, constant=True)
 
-    def observe_distortion(self, camera: Any) -> None:
+    def observe_distortion(self, camera: Any, corner_shift: float) -> None:
         """Adds residuals in the distortion alone, whose prior has mean 0."""
         diagonal = math.hypot(camera.width, camera.height) / 2
         focal = camera.mean_focal_length()
         # Information about the coefficient in N points of two rings of radius a and INNER a, after the distance
         # from their plane is eliminated: N f^2 a^6 times this number. It should be (RESIDUAL / its deviation)^2.
         left = 1 + INNER**6 - (1 + INNER**4) ** 2 / (1 + INNER**2)
-        outer = (RESIDUAL**2 / (CORNER_SHIFT**2 * left * 2 * len(RING) * diagonal**2)) ** (1 / 6)
+        outer = (RESIDUAL**2 / (corner_shift**2 * left * 2 * len(RING) * diagonal**2)) ** (1 / 6)
         radius = outer * diagonal / focal
         points = radius * np.concatenate([RING, INNER * RING])
         self._add(camera, points, points * focal, copies=2, constant=False)

@@ -14,15 +14,13 @@ from torch import Tensor
 from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.enlarged import enlarge_small
+from wildgs.sfm.incremental import LEAST_GROUP, by_size, measure_distortion
 from wildgs.sfm.lenses import drop_impossible
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import (
-    LEAST_GROUP,
-    by_size,
     continue_mapping,
     map_photos,
     map_repeatedly,
-    measure_distortion,
     missing_from,
 )
 from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, match_pairs, verified_pairs

@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 
-from wildgs.sfm.mapping import LEAST_GROUP, find_registered, missing_from
+from wildgs.sfm.incremental import LEAST_GROUP
+from wildgs.sfm.mapping import find_registered, missing_from
 from wildgs.sfm.matching import image_ids, verified_pairs
 from wildgs.sfm.pairs import Pair
 from wildgs.sfm.upright import WorkingCopy
