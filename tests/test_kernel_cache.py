@@ -89,7 +89,7 @@ def test_a_forked_process_compiles_what_its_parent_has_not(tmp_path: Path):
         [sys.executable, "-c", FORKED], capture_output=True, text=True, cwd=tmp_path, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "5.0"
+    assert "5.0" in done.stdout.splitlines()  # what the parent has not flushed follows
 
 
 def test_where_nothing_is_writable_a_temporary_folder_serves_with_one_warning(
