@@ -59,6 +59,7 @@ def test_mapping_is_repeated_while_photos_are_missing(
 
     monkeypatch.setattr(mapping, "map_photos", run)
     monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (int(1000 * agreeing), 1000))
+    monkeypatch.setattr(mapping, "is_wide", lambda model: True)
     monkeypatch.setattr(mapping, "FEW", 3 if few else 2)
     monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 4)
     models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(seed=5), silent)
@@ -66,11 +67,14 @@ def test_mapping_is_repeated_while_photos_are_missing(
     assert seeds == [5, 6, 7, 8][:tried]
 
 
-@pytest.mark.parametrize(("agreeing", "best"), [((400, 500), 1), ((0, 0), 0)])
+@pytest.mark.parametrize(
+    ("agreeing", "distorted", "best"), [((400, 500), True, 1), ((0, 0), True, 0), ((400, 500), False, 0)]
+)
 def test_matches_that_agree_outweigh_points(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: tuple[int, int], best: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: tuple[int, int], distorted: bool, best: int
 ) -> None:
-    """The first run has more observations of points than the second."""
+    """The first run has more observations; the second expects strong distortion, and counts if it finds it."""
+    monkeypatch.setattr(mapping, "is_wide", lambda model: distorted)
     copies = [WorkingCopy("a.jpg", "a", "a.jpg", False)]
     models, counts = iter([FakeModel(["a"], 900), FakeModel(["a"], 800)]), iter(agreeing)
     monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 2)

@@ -30,6 +30,9 @@ GROWTH = 1.1
 DISTORTION_FROM = 20
 """Number of photos in a model from which usual distortion is estimated while the model grows."""
 
+STRONG_SHIFT = -0.04
+"""Median displacement of the photos' corners by distortion from which they are strongly distorted."""
+
 LAST_ROUNDS = 8
 """Upper bound on rounds of the last adjustment with priors."""
 
@@ -132,9 +135,13 @@ def measure_distortion(work: Workplace, model: Any, count: int) -> None:
 
 
 def is_wide(model: Any) -> bool:
-    """Whether a model was found with distorted photos."""
-    shifts = [abs(shift) for shift in corner_shifts(model)]
-    return bool(shifts) and median(shifts) > USUAL_SHIFT
+    """Whether a model was found with strongly distorted photos.
+
+    Strong distortion of lenses moves corners inwards. Usual photos mapped with `WIDE_SHIFT` end with shifts of either
+    sign, together with wrong focal lengths, and more of their matches may agree.
+    """
+    shifts = corner_shifts(model)
+    return bool(shifts) and median(shifts) <= STRONG_SHIFT
 
 
 def _corner_shift(model: Any, wide: bool) -> float | None:

@@ -59,7 +59,8 @@ def map_repeatedly(
 ) -> list[Any]:
     """Repeats incremental mapping with other seeds while photos are missing; returns the models of the best run.
 
-    The best run is the one whose largest model has the highest score. Some runs expect distorted photos.
+    The best run is the one whose largest model has the highest score. Some runs expect strong distortion,
+    and count only if they find it.
 
     Args:
         work: The workplace.
@@ -77,7 +78,8 @@ def map_repeatedly(
         seeded = replace(config, seed=config.seed + attempt)
         wide = attempt % WIDE_EVERY == 1
         models = map_photos(work, len(copies), seeded, progress, only=names, wide=wide)
-        score, agreeing = _judge(models[0], work) if models else (-1, 0.0)
+        usable = bool(models) and (not wide or is_wide(models[0]))
+        score, agreeing = _judge(models[0], work) if usable else (-1, 0.0)
         if score > most:
             best, most, share = models, score, agreeing
         complete = bool(best) and not missing_from(best[0], only or copies)
