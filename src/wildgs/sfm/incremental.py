@@ -137,8 +137,8 @@ def measure_distortion(work: Workplace, model: Any, count: int) -> None:
 def is_wide(model: Any) -> bool:
     """Whether a model was found with strongly distorted photos.
 
-    Strong distortion of lenses moves corners inwards. Usual photos mapped with `WIDE_SHIFT` end with shifts of either
-    sign, together with wrong focal lengths, and more of their matches may agree.
+    Strong distortion of lenses moves corners inwards. Usual photos mapped with `WIDE_SHIFT` end with shifts of
+    either sign, together with wrong focal lengths, and more of their matches may agree.
     """
     shifts = corner_shifts(model)
     return bool(shifts) and median(shifts) <= STRONG_SHIFT
