@@ -14,8 +14,8 @@ from typing import Any
 import pycolmap
 
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.lens_priors import USUAL_SHIFT, WIDE_SHIFT, LensPrior, adjust_with_priors, corner_shifts
-from wildgs.sfm.lenses import FOCAL_RANGE
+from wildgs.sfm.lens_priors import USUAL_SHIFT, WIDE_SHIFT, LensPrior, adjust_with_priors
+from wildgs.sfm.lenses import FOCAL_RANGE, corner_shift
 from wildgs.sfm.workplace import Workplace
 
 LEAST_GROUP = 3
@@ -140,7 +140,7 @@ def is_wide(model: Any) -> bool:
     Strong distortion of lenses moves corners inwards. Usual photos mapped with `WIDE_SHIFT` end with shifts of
     either sign, together with wrong focal lengths, and more of their matches may agree.
     """
-    shifts = corner_shifts(model)
+    shifts = [corner_shift(model.image(photo).camera) for photo in model.reg_image_ids()]
     return bool(shifts) and median(shifts) <= STRONG_SHIFT
 
 
@@ -154,10 +154,10 @@ def _corner_shift(model: Any, wide: bool) -> float | None:
 def _finish(
     model: Any,
     priors: Mapping[int, LensPrior],
-    corner_shift: float | None,
+    spread: float | None,
     constant: Collection[int] = (),
 ) -> None:
-    adjust_with_priors(model, priors, corner_shift=corner_shift, constant=constant, rounds=LAST_ROUNDS)
+    adjust_with_priors(model, priors, corner_shift=spread, constant=constant, rounds=LAST_ROUNDS)
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
 
 

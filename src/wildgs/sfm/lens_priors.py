@@ -133,16 +133,6 @@ def _adjust(
     return bool(summary.is_solution_usable()) and all(math.isfinite(f) and f > 0 for f in lengths)
 
 
-def corner_shifts(model: Any) -> list[float]:
-    """Displacement of each registered photo's corners by distortion, relative to their distance from the centre."""
-    shifts = []
-    for photo in model.reg_image_ids():
-        camera = model.image(photo).camera
-        corner = math.hypot(camera.width, camera.height) / 2 / camera.mean_focal_length()
-        shifts.append(float(camera.params[3]) * corner**2 if camera.model_name == "SIMPLE_RADIAL" else 0.0)
-    return shifts
-
-
 class _PseudoObservations:
     """Images that do not exist and their points, in a copy of a model."""
 

@@ -29,15 +29,24 @@ def lens_fault(camera: Any) -> str | None:
     if not FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1]:
         degrees = 2 * np.degrees(np.arctan(0.5 / focal))
         return f"implausible field of view ({degrees:.0f} degrees): a stitched panorama or a wrong pose"
-    if camera.model_name != "SIMPLE_RADIAL":
-        return None
-    corner = np.hypot(camera.width, camera.height) / 2 / camera.params[0]
-    shift = float(camera.params[3]) * corner**2
+    shift = corner_shift(camera)
     # If 1 + 3 k r^2 is negative, the distortion is not injective.
     if abs(shift) > MAX_DISTORTION or 1 + 3 * shift < 0:
         amount = f"{abs(shift):.0%} at the corners"
         return f"implausible distortion ({amount}): a panorama, a little planet or a wrong pose"
     return None
+
+
+def corner_shift(camera: Any) -> float:
+    """Displacement of a photo's corners by distortion, relative to their distance from the centre.
+
+    Args:
+        camera: pycolmap's camera; 0 for models other than SIMPLE_RADIAL.
+    """
+    if camera.model_name != "SIMPLE_RADIAL":
+        return 0.0
+    focal, _, _, radial = camera.params
+    return float(radial * (np.hypot(camera.width, camera.height) / 2 / focal) ** 2)
 
 
 def drop_impossible(model: Any) -> dict[str, str]:
