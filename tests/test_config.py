@@ -123,6 +123,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert train["objective"].pop("mask_weight_photos") > 0
     assert train["objective"].pop("mask_power") > 1
     assert train["objective"].pop("consensus") is True
+    assert train["objective"].pop("free_space") is True
     assert train["objective"].pop("sky_weight") > 0
     assert train["objective"].pop("opaque_weight") > 0
     assert train["density"].pop("min_visibility") > 0.5
@@ -139,6 +140,7 @@ def test_runs_of_earlier_versions_resume_as_they_began():
     assert config.train.optimizer.short_runs == 0
     assert (config.train.objective.mask_weight_photos, config.train.objective.mask_power) == (0, 1)
     assert config.train.objective.consensus is False
+    assert config.train.objective.free_space is False
     assert config.train.objective.sky_weight == 0
     assert config.train.objective.opaque_weight == 0
     assert config.train.density.min_visibility == 0.5

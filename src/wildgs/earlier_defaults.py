@@ -22,6 +22,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "objective", "mask_weight_photos"): ("mask_weight_end", 0),
     ("train", "objective", "mask_power"): ("mask_weight_end", 1.0),
     ("train", "objective", "consensus"): ("mask_weight_end", False),
+    ("train", "objective", "free_space"): ("mask_weight_end", False),
     ("train", "objective", "sky_weight"): ("mask_weight_end", 0.0),
     ("train", "objective", "opaque_weight"): ("mask_weight_end", 0.0),
     ("train", "density", "min_visibility"): ("least_pixels", 0.5),

@@ -59,6 +59,7 @@ _PAPER: dict[str, Any] = {
     "train.objective.mask_weight_photos": 0,
     "train.objective.mask_power": 1.0,
     "train.objective.consensus": False,
+    "train.objective.free_space": False,
     "train.schedule.encoder_every": 1,
     "train.schedule.reset_every": 3000,
     "train.schedule.mask_every": 1,

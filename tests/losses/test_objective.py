@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from wildgs.losses.evidence import PROOF
 from wildgs.losses.objective import (
     OUTLYING,
     ObjectiveConfig,
@@ -178,6 +179,24 @@ def test_depth_in_front_of_the_sky_is_penalised_by_its_nearness() -> None:
     loss.backward()
     assert depth.grad is not None
     assert depth.grad.tolist() == [[pytest.approx(-0.0625), pytest.approx(-0.0625)], [0.0, 0.0]]
+
+
+def test_sky_is_static() -> None:
+    photo = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
+    render = photo.clone()
+    render[:, 16:32] = 1 - render[:, 16:32]
+    visibility = torch.full((48, 48), 0.9, requires_grad=True)
+    sky = torch.zeros(48, 48, dtype=torch.bool)
+    sky[:16] = True
+    observations = torch.tensor([[24.5, 40.5]])
+    config = ObjectiveConfig()
+    losses = total_loss(config, 0.0, photo, render, visibility=visibility, sky=sky, observations=observations)
+    losses.image.backward()
+    gradient = visibility.grad
+    assert gradient is not None
+    assert bool((gradient[:16] == -PROOF / 48**2).all())
+    assert float(gradient[40, 24]) == pytest.approx(-PROOF / 48**2)
+    assert float(gradient[18:38, 20:28].mean()) > 0.05 / 48**2
 
 
 def test_pixels_that_the_user_masks_are_no_sky() -> None:

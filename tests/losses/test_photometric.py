@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from wildgs.losses.evidence import (
     FLAT,
+    MOST_EVIDENCE,
     PROOF,
     color_evidence,
     proven_static,
@@ -347,6 +348,23 @@ def test_proof_shows_what_evidence_would_hide():
     gradient = visibility.grad[22:38]
     assert bool((gradient[:, 20:26] == -PROOF / 3600).all())
     assert float(gradient[:, 27:33].mean()) > 0.1 / 3600
+
+
+def test_foregrounds_are_transient_whatever_their_colour():
+    photo, _ = pictures(60, 60)
+    visibility = torch.full((60, 60), 0.9, dtype=torch.float64, requires_grad=True)
+    foreground = torch.zeros(20, 20, dtype=torch.float64)
+    foreground[:, 10:] = 1
+    proven = torch.zeros(60, 60, dtype=torch.bool)
+    proven[50:] = True
+    doubt = torch.zeros(4, 4, dtype=torch.float64)
+    loss = masked_photometric(photo, photo, visibility, proven=proven, doubt=doubt, foreground=foreground)
+    loss.backward()
+    gradient = visibility.grad[:50]
+    assert bool((gradient[:, :28] == 0).all())
+    torch.testing.assert_close(gradient[:, 32:], torch.full((50, 28), MOST_EVIDENCE / 3600).double())
+    assert bool((visibility.grad[50:] == -PROOF / 3600).all())
+    assert float(loss) == pytest.approx(0, abs=1e-9), "evidence changed the value"
 
 
 def lit_wall(surroundings: float, wall: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor]:

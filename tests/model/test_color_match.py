@@ -31,7 +31,9 @@ def match_colors(
     """The match where the mask is these weights."""
     picture = Rendering(render, torch.ones_like(weights), torch.ones_like(weights))
     codes = render[..., :0] if codes is None else codes
-    return match_photo(photo, picture, weights, None, threshold=0.0, sky=sky, codes=codes, training=training)
+    return match_photo(
+        photo, picture, None, weights, None, threshold=0.0, sky=sky, codes=codes, training=training
+    )
 
 
 def match_sky(

@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from tests.memory_views import make_view, with_photos
 from wildgs.geometry.camera import Camera
-from wildgs.priors.depth_points import DepthPointsConfig, depth_points, fit_disparity, known_depth
+from wildgs.priors.depth_points import (
+    DepthPointsConfig,
+    aligned_depth,
+    depth_points,
+    fit_disparity,
+    known_depth,
+)
 from wildgs.scene import Alignment, Scene, View
 
 SIDE, WALL = 64, 2.0
@@ -115,12 +121,12 @@ def test_depth_is_known_where_a_map_tells_it() -> None:
     metric = np.zeros((SIDE, SIDE), np.float32)
     metric[:4] = 1.0
     made = scene()
-    known = known_depth(with_photos(made.views[0], disparity=codes, depth=metric), made.points)
+    known = known_depth(made, with_photos(made.views[0], disparity=codes, depth=metric))
     assert known is not None
     expected = torch.ones(SIDE, SIDE, dtype=torch.bool)
     expected[4:8], expected[-8:] = False, False
     assert torch.equal(known, expected)
-    assert known_depth(with_photos(made.views[0], disparity=None), made.points) is None
+    assert known_depth(made, with_photos(made.views[0], disparity=None)) is None
 
 
 def test_disparity_that_is_noise_is_passed_over() -> None:
@@ -166,3 +172,23 @@ def test_metric_depth_of_two_photos_is_enough_and_brings_their_disparity_to_scal
     right = filled[(filled[:, 0] > 0.1) & (filled[:, 1] > 0.05)]
     assert len(right) > 20
     assert (right[:, 2] - WALL).abs().max() < 0.05
+
+
+def test_disparity_is_aligned_to_what_the_photo_observes() -> None:
+    """Points of the other side of the building project into the photo, too."""
+    made = scene()
+    behind = torch.rand(4 * len(made.points), 3, generator=torch.Generator().manual_seed(0))
+    behind = (behind - 0.5) * torch.tensor([2.0, 1.0, 6.0]) + torch.tensor([0.0, -0.5, 6.0])
+    mixed = replace(
+        made,
+        points=torch.cat([made.points, behind]),
+        point_colors=torch.zeros(5 * len(made.points), 3, dtype=torch.uint8),
+    )
+    assert aligned_depth(mixed, made.views[0], torch.Generator())[1] is None
+    count = len(made.points)
+    rows = torch.stack([torch.zeros(count), torch.arange(count)], dim=1).int()
+    aligned = aligned_depth(replace(mixed, observations=rows), made.views[0], torch.Generator())[1]
+    assert aligned is not None
+    known = aligned > 0  # not beyond nearly all of the points
+    assert known.float().mean() > 0.9
+    torch.testing.assert_close(aligned[known], relief()[known], rtol=0.02, atol=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,9 +16,9 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
 from wildgs.priors.depth_points import known_depth
 from wildgs.priors.sky_pixels import find_sky_pixels
-from wildgs.scene import View
+from wildgs.scene import Scene, View
 from wildgs.scene.image_cache import AHEAD
-from wildgs.scene.scene import converted
+from wildgs.scene.scene import converted, observed_pixels
 
 
 class ViewSampler:
@@ -79,8 +79,7 @@ class PhotoFeed:
         sampler: ViewSampler,
         team: Team,
         device: torch.device,
-        observations: Mapping[str, Float[Tensor, "_ 2"]] | None = None,
-        points: Float[Tensor, "P 3"] | None = None,
+        scene: Scene | None = None,
     ) -> None:
         """Creates the feed.
 
@@ -89,18 +88,18 @@ class PhotoFeed:
             sampler: Their order.
             team: The processes that train.
             device: Device of the training.
-            observations: Pixels of triangulated points by the photo's name.
-            points: Sparse points, for `sky`.
+            scene: The scene of the photos, whose sparse points `observations` and `sky` need.
         """
         self.views = views
         self.sampler = sampler
         self.team = team
         self.device = device
         self.batch = ""
-        self._observations = {name: pixels.to(device) for name, pixels in (observations or {}).items()}
+        self._scene = scene
+        observed = {} if scene is None else observed_pixels(scene)
+        self._observations = {name: pixels.to(device) for name, pixels in observed.items()}
         self._unreadable: set[str] = set()
         self._cameras: dict[str, Camera] = {}
-        self._points = torch.zeros(0, 3) if points is None else points
         self._sky: dict[str, Bool[Tensor, "_ _"]] = {}
         self._kept = DeviceCache(device)
 
@@ -168,8 +167,9 @@ class PhotoFeed:
     def sky(self, view: View) -> Bool[Tensor, "H W"]:
         """Pixels of the photo that certainly show sky; found once at low resolution."""
         if view.name not in self._sky:
-            known = known_depth(view, self._points)
-            found = find_sky_pixels(view.read_photo(), view.camera, self._points, known)
+            assert self._scene is not None
+            known = known_depth(self._scene, view)
+            found = find_sky_pixels(view.read_photo(), view.camera, self._scene.points, known)
             self._sky[view.name] = found.to(self.device)
         small = self._sky[view.name].float()[None, None]
         return functional.interpolate(small, size=(view.camera.height, view.camera.width))[0, 0] > 0.5

@@ -18,6 +18,7 @@ from wildgs.engine.consensus import Consensus
 from wildgs.engine.density import STRATEGIES, DensityReport, SeenView
 from wildgs.engine.feed import PhotoFeed, ViewSampler
 from wildgs.engine.flat_ground import FlatGround
+from wildgs.engine.foregrounds import Foregrounds
 from wildgs.engine.loss_replay import LossReplays
 from wildgs.engine.optimizers import Optimizers, sort_rows
 from wildgs.engine.photo_counts import PhotoCounts
@@ -40,7 +41,6 @@ from wildgs.model.precision import (
 from wildgs.model.training_pass import SeenPhoto, TrainingOutput
 from wildgs.progress import Counter
 from wildgs.scene import Scene, View, scene_extent
-from wildgs.scene.scene import observed_pixels
 
 PREPARATION_PHOTOS = 16
 FEATURE_CACHE_BYTES = 10**9
@@ -51,6 +51,7 @@ class Trainer:
 
     Attributes:
         consensus: What may be transient in the training photos, as far as they have been compared.
+        foregrounds: What training photos show in free space.
         photo_counts: How many photos show each Gaussian, and hence how often it is dropped.
         warps: Displacements of the training photos.
         on_compared_photo: Called with (photos done, total number of photos) when the photos are compared.
@@ -102,15 +103,14 @@ class Trainer:
         self.density = strategy(config.density, extent, len(method.gaussians), self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampler = ViewSampler(len(self.views), self.generator)
-        self.feed = PhotoFeed(
-            self.views, self.sampler, self.team, self.device, observed_pixels(scene), scene.points
-        )
+        self.feed = PhotoFeed(self.views, self.sampler, self.team, self.device, scene)
         objective = config.objective
         if not method.sky_depth:  # nothing need be behind the scene
             objective = replace(objective, opaque_weight=0.0)
         self._objective = objective
-        evident = objective.consensus and objective.mask_gradient == "evidence"
-        self.consensus = Consensus(self.device, len(self.views), self.schedule.mask_steps if evident else 0)
+        evident = self.schedule.mask_steps if objective.mask_gradient == "evidence" else 0
+        self.consensus = Consensus(self.device, len(self.views), evident if objective.consensus else 0)
+        self.foregrounds = Foregrounds(scene, self.device, evident if objective.free_space else 0)
         self.flat_ground = FlatGround(method, scene, config.flat_ground)
         self.photo_counts = PhotoCounts(method, config.dropout, config.steps, needed=self.flat_ground.is_used)
         begin = self.schedule.first_stage
@@ -299,6 +299,7 @@ class Trainer:
             mask_threshold=self.method.mask_threshold,
             num_photos=len(self.views),
             doubt=self.consensus.doubt(view.name),
+            foreground=None if output.visibility is None else self.foregrounds.of(view.name, self.step),
         )
         if output.visibility is not None:
             self.consensus.observe(output.visibility, self.step)

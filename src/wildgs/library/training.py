@@ -251,6 +251,7 @@ def _train_unless_full(job: _Job, config: RunConfig, resume: bool) -> TrainedRun
         trainer.cuda_graphs = job.execution.cuda_graphs
         trainer.feature_cache = parse_bytes(job.execution.feature_cache)
         trainer.on_compared_photo = counter(job.progress, "comparing training photos")
+        trainer.foregrounds.on_photo = counter(job.progress, "comparing depth maps")
         trainer.on_final_photo = counter(job.progress, "fitting the light of training photos")
         with ExitStack() as stack:
             if job.team.first:

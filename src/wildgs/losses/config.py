@@ -32,6 +32,8 @@ class ObjectiveConfig:
             render.
         consensus: Whether, once masks hide more than passers-by usually cover, evidence counts only where other
             photos do not show the same (`wildgs.priors.consensus`). Needs a frozen encoder. Not in the paper.
+        free_space: Whether what a photo shows in space that other photos see through, by depth priors, counts as
+            evidence (`wildgs.priors.free_space`). Not in the paper.
         min_alpha: Smallest accumulated alpha of a pixel that enters the depth loss.
     """
 
@@ -46,6 +48,7 @@ class ObjectiveConfig:
     opaque_weight: float = 0.03
     mask_gradient: Literal["evidence", "loss"] = "evidence"
     consensus: bool = True
+    free_space: bool = True
     min_alpha: float = 0.5
 
     def mask_weight(self, progress: float, num_photos: int | None = None) -> float:

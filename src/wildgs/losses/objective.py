@@ -66,6 +66,7 @@ def total_loss(
     mask_threshold: float = 0.5,
     num_photos: int | None = None,
     doubt: Float[Tensor, "_ _"] | None = None,
+    foreground: Float[Tensor, "_ _"] | None = None,
 ) -> Losses:
     """The paper's L_total for one photo.
 
@@ -88,6 +89,7 @@ def total_loss(
         mask_threshold: Threshold Th of static pixels for the depth loss.
         num_photos: Number of training photos, on which λ^M depends; None for enough of them.
         doubt: Degree to which pixels may be transient, in cells; see `masked_photometric`.
+        foreground: Degree to which pixels are transient for another reason, in cells; see `masked_photometric`.
 
     Returns:
         All terms.
@@ -108,6 +110,7 @@ def total_loss(
         proven=None if observations is None else proven_static(observations, *photo.shape[:2]),
         mask_threshold=mask_threshold,
         doubt=doubt,
+        foreground=foreground,
     )
 
 
@@ -128,6 +131,7 @@ def weighted_losses(
     proven: Bool[Tensor, "H W"] | None = None,
     mask_threshold: float = 0.5,
     doubt: Float[Tensor, "_ _"] | None = None,
+    foreground: Float[Tensor, "_ _"] | None = None,
 ) -> Losses:
     """`total_loss` where all that changes from step to step is a tensor, for CUDA graphs.
 
@@ -144,11 +148,13 @@ def weighted_losses(
         disparity: Monocular estimate.
         metric_depth: Depth in world units.
         sky: Pixels that certainly show sky.
-        proven: Pixels known to be static (`proven_static`).
+        proven: Pixels known to be static (`proven_static`), besides those that show sky.
         mask_threshold: Threshold Th.
         doubt: Degree to which pixels may be transient.
+        foreground: Degree to which pixels are transient for another reason.
     """
-    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven, doubt)
+    static = proven if sky is None else sky if proven is None else sky | proven
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), static, doubt, foreground)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:
@@ -182,11 +188,19 @@ def _image_loss(
     mask: Tensor | None,
     proven: Tensor | None,
     doubt: Tensor | None,
+    foreground: Tensor | None,
 ) -> Tensor:
     """L^I, with the configured gradient to the mask."""
     if mask is None or config.mask_gradient == "evidence":
         return masked_photometric(
-            photo, render, mask, config.weight_l1, power=config.mask_power, proven=proven, doubt=doubt
+            photo,
+            render,
+            mask,
+            config.weight_l1,
+            power=config.mask_power,
+            proven=proven,
+            doubt=doubt,
+            foreground=foreground,
         )
     mask = mask[..., None] ** config.mask_power
     return masked_photometric(photo * mask, render * mask, None, config.weight_l1)

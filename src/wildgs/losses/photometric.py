@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from wildgs.losses.evidence import PROOF, transient_evidence
+from wildgs.losses.evidence import MOST_EVIDENCE, PROOF, transient_evidence
 from wildgs.losses.ssim import ssim
 
 
@@ -20,6 +20,7 @@ def masked_photometric(
     power: float = 1.0,
     proven: Bool[Tensor, "H W"] | None = None,
     doubt: Float[Tensor, "_ _"] | None = None,
+    foreground: Float[Tensor, "_ _"] | None = None,
 ) -> Float[Tensor, ""]:
     """``λ |I⊙M - Î⊙M| + (1 - λ) (1 - SSIM(I⊙M, Î⊙M))``, paper section 'Transient Objects Handling'.
 
@@ -39,6 +40,8 @@ def masked_photometric(
         proven: Pixels known to be static (`proven_static`); None for none.
         doubt: Degree to which pixels may be transient, 0 to 1, a factor on the evidence, in cells that cover the
             photo (`wildgs.priors.consensus.doubts`); None for 1 everywhere.
+        foreground: Degree to which pixels are transient whatever their colour, 0 to 1, in cells that cover the
+            photo (`wildgs.priors.free_space`); None for 0 everywhere.
 
     Returns:
         The loss.
@@ -52,12 +55,17 @@ def masked_photometric(
         # Adds zero to the value and the evidence to the mask's gradient.
         evidence = transient_evidence(photo, render.detach())
         if doubt is not None:
-            cells = functional.interpolate(doubt[None, None], size=evidence.shape, mode="bilinear")
-            evidence = evidence * cells[0, 0]
+            evidence = evidence * _enlarged(doubt, evidence)
+        if foreground is not None:
+            evidence = torch.maximum(evidence, MOST_EVIDENCE * _enlarged(foreground, evidence))
         if proven is not None:
             evidence = torch.where(proven, -PROOF, evidence)
         loss = loss + ((visibility - fixed) * evidence).mean()
     return loss
+
+
+def _enlarged(cells: Tensor, pixels: Tensor) -> Tensor:
+    return functional.interpolate(cells[None, None], size=pixels.shape, mode="bilinear")[0, 0]
 
 
 def _photometric(photo: Tensor, render: Tensor, weight_l1: float) -> Tensor:

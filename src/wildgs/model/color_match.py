@@ -75,6 +75,7 @@ Region = tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels _"]]
 def match_photo(
     photo: Float[Tensor, "*pixels 3"],
     rendering: Rendering,
+    likeness: Float[Tensor, "*pixels"] | None,
     visibility: Float[Tensor, "*pixels"] | None,
     keep: Bool[Tensor, "*pixels"] | None,
     *,
@@ -90,6 +91,7 @@ def match_photo(
     Args:
         photo: RGB in [0, 1].
         rendering: The render of the photo's camera.
+        likeness: Weights of pixels (`wildgs.model.likeness`), not used for the sky; None for equal ones.
         visibility: M; not used for the sky.
         keep: The user's mask: False = ignore the pixel.
         threshold: Threshold Th of static pixels.
@@ -106,6 +108,8 @@ def match_photo(
     if keep is not None:
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
+    if likeness is not None:
+        weights = weights * likeness
     ones = torch.ones_like(weights)[..., None]
     regions = [(weights if sky is None else weights * ~sky.which, torch.cat([ones, codes], dim=-1))]
     if sky is not None:

@@ -32,6 +32,7 @@ from wildgs.model.color_match import (
 )
 from wildgs.model.config import WildGSConfig
 from wildgs.model.gaussians import Gaussians, spread_rows
+from wildgs.model.likeness import likeness
 from wildgs.model.sky import Sky, find_sky, sine_of_elevation
 from wildgs.model.wrapping import liftable
 from wildgs.rasterize import Projection, Rendering, blend, blend_sample
@@ -174,9 +175,11 @@ class PhotoMatch(nn.Module):
             training: Whether to fit a gain per channel only; see `match_photo`.
         """
         pixels = (...,) if picture.pixels is None else picture.pixels
+        photo = sight.photo[pixels]
         return match_photo(
-            sight.photo[pixels],
+            photo,
             picture.rendering,
+            likeness(photo, picture.rendering.colors, picture.pixels, *sight.photo.shape[:2]),
             None if sight.visibility is None else sight.visibility[pixels],
             None if sight.keep is None else sight.keep[pixels],
             threshold=self.config.mask_threshold,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.priors.config import DepthPointsConfig
-from wildgs.scene.scene import Scene, View
+from wildgs.scene.scene import Scene, View, observed_rows
 
 MAX_PHOTOS = 200
 """Maximum number of photos that are used; larger scenes are subsampled evenly."""
@@ -68,7 +68,7 @@ def depth_points(
         return empty
     generator = torch.Generator().manual_seed(seed)
     views = _subsample(scene.train_views)
-    photos = [photo for view in views for photo in _photo_depths(view, scene.points, config, generator)]
+    photos = [photo for view in views for photo in _photo_depths(scene, view, config, generator)]
     existing, parts = scene.points, [empty]
     for votes, cell in ((METRIC_VOTES, METRIC_CELL * config.cell), (1, config.cell)):
         sources = [photo for photo in photos if photo.votes == votes]
@@ -121,10 +121,10 @@ def _sample_at(
 
 
 def _photo_depths(
-    view: View, points: Float[Tensor, "P 3"], config: DepthPointsConfig, generator: torch.Generator
+    scene: Scene, view: View, config: DepthPointsConfig, generator: torch.Generator
 ) -> Iterator[_PhotoDepth]:
     """Depth of a photo in the scene's scale: metric depth, and aligned disparity where metric depth is missing."""
-    metric, aligned = aligned_depth(view, points, generator)
+    metric, aligned = aligned_depth(scene, view, generator)
     if metric is not None:
         yield _to_points(view, metric, METRIC_VOTES, config)
     if aligned is not None:
@@ -132,34 +132,40 @@ def _photo_depths(
 
 
 def aligned_depth(
-    view: View, points: Float[Tensor, "P 3"], generator: torch.Generator
+    scene: Scene, view: View, generator: torch.Generator
 ) -> tuple[Float[Tensor, "H W"] | None, Float[Tensor, "H W"] | None]:
     """Reads the depth maps of a photo.
 
+    Disparity is aligned to the points that the photo observes or, if that fails, to all that project into it, some
+    of which are hidden by passers-by or on the other side of the building.
+
     Args:
+        scene: The scene, with its sparse points.
         view: The photo.
-        points: Sparse points, to which disparity is aligned.
         generator: Random numbers for the fit.
 
     Returns:
         Metric depth, and disparity converted to depth where metric depth is missing, both in world units along the
         camera's z axis and 0 where unknown; None for a map that does not exist or cannot be aligned.
     """
-    metric, disparity = view.read_depth(), view.read_disparity()
-    aligned = None if disparity is None else _align(view.camera, disparity, metric, points, generator)
+    metric, disparity, aligned = view.read_depth(), view.read_disparity(), None
+    if disparity is not None:
+        for points in (scene.points[observed_rows(scene, view)], scene.points):
+            if aligned is None:
+                aligned = _align(view.camera, disparity, metric, points, generator)
     if aligned is not None and metric is not None:
         aligned = torch.where(metric > 0, 0.0, aligned)
     return metric, aligned
 
 
-def known_depth(view: View, points: Float[Tensor, "P 3"]) -> Bool[Tensor, "H W"] | None:
+def known_depth(scene: Scene, view: View) -> Bool[Tensor, "H W"] | None:
     """Pixels of which a depth map of the photo tells the depth; None without usable depth maps.
 
     Args:
+        scene: The scene, to whose sparse points disparity is aligned.
         view: The photo.
-        points: Sparse points, to which disparity is aligned.
     """
-    maps = [depth > 0 for depth in aligned_depth(view, points, torch.Generator()) if depth is not None]
+    maps = [depth > 0 for depth in aligned_depth(scene, view, torch.Generator()) if depth is not None]
     return reduce(torch.logical_or, maps) if maps else None
 
 

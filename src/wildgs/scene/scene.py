@@ -203,6 +203,12 @@ def observations_of(
     return moved[moved[:, 0] >= 0]
 
 
+def observed_rows(scene: Scene, view: View) -> Int[Tensor, " K"]:
+    """Rows of the points that a photo of the scene observes."""
+    row = next(index for index, other in enumerate(scene.views) if other.name == view.name)
+    return scene.observations[scene.observations[:, 0] == row, 1].unique().long()
+
+
 def observed_pixels(
     scene: Scene, least_photos: int = LEAST_PHOTOS, split: Split = "train"
 ) -> dict[str, Float[Tensor, "K 2"]]:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Int
 
 from wildgs.scene import Scene, View
+from wildgs.scene.scene import observed_rows
 
 _LEAST_SHARED = 3
 _BEST_ANGLE, _NARROWER, _WIDER = 10.0, 4.0, 12.0  # degrees; wide enough to tell depth, narrow enough to match
@@ -57,8 +58,7 @@ def choose_neighbours(scene: Scene, most: int) -> list[list[int]]:
 
 def seen_rows(scene: Scene, view: View) -> Int[np.ndarray, " K"]:
     """Rows of the points that a photo observes; without observations, of all points that project into it."""
-    row = next(index for index, other in enumerate(scene.views) if other.name == view.name)
-    observed = scene.observations[scene.observations[:, 0] == row, 1].unique().long()
+    observed = observed_rows(scene, view)
     if len(observed) >= _LEAST_SHARED:
         return observed.numpy()
     pixels, z = view.camera.project(scene.points)
