@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from wildgs.losses.evidence import (
     FLAT,
-    MOST_EVIDENCE,
+    FOREGROUND_EVIDENCE,
     PROOF,
     color_evidence,
     proven_static,
@@ -362,9 +362,9 @@ def test_foregrounds_are_transient_whatever_their_colour():
     loss.backward()
     gradient = visibility.grad[:50]
     assert bool((gradient[:, :28] == 0).all())
-    torch.testing.assert_close(gradient[:, 32:], torch.full((50, 28), MOST_EVIDENCE / 3600).double())
+    torch.testing.assert_close(gradient[:, 32:], torch.full((50, 28), FOREGROUND_EVIDENCE / 3600).double())
     assert bool((visibility.grad[50:] == -PROOF / 3600).all())
-    assert float(loss) == pytest.approx(0, abs=1e-9), "evidence changed the value"
+    assert float(loss.detach()) == pytest.approx(0, abs=1e-9), "evidence changed the value"
 
 
 def lit_wall(surroundings: float, wall: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor]:

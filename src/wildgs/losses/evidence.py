@@ -22,6 +22,8 @@ HALF_EVIDENCE = 0.11
 MOST_EVIDENCE = 0.8
 """Maximum of the evidence, in units of the image loss: twice the initial λ^M, so that certain transients are hidden
 at once."""
+FOREGROUND_EVIDENCE = 0.4
+"""Evidence of what a depth prior shows in free space, in the same units; such priors are wrong at times."""
 NIGHT, DUSK = 0.15, 0.3
 """Median brightness of a photo below which it was taken at night, and from which on it was not."""
 LIT = 0.1

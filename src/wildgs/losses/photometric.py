@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from wildgs.losses.evidence import MOST_EVIDENCE, PROOF, transient_evidence
+from wildgs.losses.evidence import FOREGROUND_EVIDENCE, PROOF, transient_evidence
 from wildgs.losses.ssim import ssim
 
 
@@ -57,7 +57,7 @@ def masked_photometric(
         if doubt is not None:
             evidence = evidence * _enlarged(doubt, evidence)
         if foreground is not None:
-            evidence = torch.maximum(evidence, MOST_EVIDENCE * _enlarged(foreground, evidence))
+            evidence = torch.maximum(evidence, FOREGROUND_EVIDENCE * _enlarged(foreground, evidence))
         if proven is not None:
             evidence = torch.where(proven, -PROOF, evidence)
         loss = loss + ((visibility - fixed) * evidence).mean()
