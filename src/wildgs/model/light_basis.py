@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from wildgs.geometry.spherical_harmonics import sh_values
 from wildgs.model.appearance import Appearance
 from wildgs.model.gaussians import Gaussians
-from wildgs.model.likeness import likeness
 from wildgs.model.method import Method
 from wildgs.model.photo_match import Sight
 from wildgs.model.wrapping import liftable
@@ -120,7 +119,6 @@ class LightBasis(nn.Module):
             counts = counts * sight.keep
         if int((counts > 0).sum()) < LEAST_PIXELS:
             return appearance
-        counts = counts * likeness(sight.photo, rendering.colors, None, *sight.photo.shape[:2])
         residual = sight.photo - rendering.colors.clamp(max=1)
         images = self._images(projection, method.gaussians.means)
         return replace(appearance, basis_weights=fit_weights(images, residual, counts))

@@ -14,7 +14,7 @@ from torch import Tensor
 from wildgs.losses.evidence import FLAT, SAME_STRUCTURE, structural_correlation
 from wildgs.rasterize import TILE
 
-LEAST = 0.05
+LEAST = 0.2
 """Weight of pixels with another structure, so that a photo of which nothing is known yet has a light."""
 
 

@@ -175,13 +175,16 @@ class PhotoMatch(nn.Module):
             training: Whether to fit a gain per channel only; see `match_photo`.
         """
         pixels = (...,) if picture.pixels is None else picture.pixels
-        photo = sight.photo[pixels]
+        photo, render = sight.photo[pixels], picture.rendering.colors
+        keep = None if sight.keep is None else sight.keep[pixels]
+        # What the user masks must not matter beside it either.
+        read = photo if keep is None else torch.where(keep[..., None], photo, render)
         return match_photo(
             photo,
             picture.rendering,
-            likeness(photo, picture.rendering.colors, picture.pixels, *sight.photo.shape[:2]),
+            likeness(read, render, picture.pixels, *sight.photo.shape[:2]),
             None if sight.visibility is None else sight.visibility[pixels],
-            None if sight.keep is None else sight.keep[pixels],
+            keep,
             threshold=self.config.mask_threshold,
             sky=picture.sky,
             codes=picture.codes,
