@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
+from wildgs.model.likeness import likeness
 from wildgs.model.sky import Sky
 from wildgs.model.wrapping import MIN_ALPHA, liftable
 from wildgs.rasterize import Rendering
@@ -75,7 +76,6 @@ Region = tuple[Float[Tensor, "*pixels"], Float[Tensor, "*pixels _"]]
 def match_photo(
     photo: Float[Tensor, "*pixels 3"],
     rendering: Rendering,
-    likeness: Float[Tensor, "*pixels"] | None,
     visibility: Float[Tensor, "*pixels"] | None,
     keep: Bool[Tensor, "*pixels"] | None,
     *,
@@ -83,6 +83,7 @@ def match_photo(
     sky: Sky | None,
     codes: Float[Tensor, "*pixels L"],
     training: bool = False,
+    tiles: tuple[Int[Tensor, "*pixels"], int] | None = None,
 ) -> Float[Tensor, "3 M"]:
     """Fits the colour transform from a render to its photo, separately for the landmark and the sky.
 
@@ -91,13 +92,14 @@ def match_photo(
     Args:
         photo: RGB in [0, 1].
         rendering: The render of the photo's camera.
-        likeness: Weights of pixels (`wildgs.model.likeness`), not used for the sky; None for equal ones.
         visibility: M; not used for the sky.
         keep: The user's mask: False = ignore the pixel.
         threshold: Threshold Th of static pixels.
         sky: Sky pixels; None fits one transform for all pixels.
         codes: Rendered light codes of the landmark, on which its transform depends linearly; L may be 0.
         training: Fit a gain per channel (a diagonal A) only.
+        tiles: Tiles of the pixels of a sample, and their number; the landmark's pixels are then weighted by
+            `wildgs.model.likeness`.
 
     Returns:
         Transform [A | b | W] of the landmark: colours c become ``c + A c + b + W codes``; with a sky, followed by
@@ -108,10 +110,12 @@ def match_photo(
     if keep is not None:
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
-    if likeness is not None:
-        weights = weights * likeness
+    if sky is not None:
+        weights = weights * ~sky.which
+    if tiles is not None:
+        weights = weights * likeness(photo, rendering.colors, weights, *tiles)
     ones = torch.ones_like(weights)[..., None]
-    regions = [(weights if sky is None else weights * ~sky.which, torch.cat([ones, codes], dim=-1))]
+    regions = [(weights, torch.cat([ones, codes], dim=-1))]
     if sky is not None:
         elevated = torch.cat([ones, elevation_powers(sky.sine)], dim=-1)
         regions.append(((covered & sky.which).float(), elevated))

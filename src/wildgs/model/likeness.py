@@ -1,4 +1,4 @@
-"""Where a photo and a render show the same structure, so that the difference of their colours is light.
+"""Which parts of a photo tell its light: those that do not differ from the render in colour and structure alike.
 
 Not in the paper. Light codes that are fitted to a whole photo represent a coach, too: columns become green below
 its roof, and dark at dusk. Under such a light the render differs little from the photo, so that no mask is learnt
@@ -11,56 +11,62 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from wildgs.losses.evidence import FLAT, SAME_STRUCTURE, structural_correlation
-from wildgs.rasterize import TILE
+from wildgs.losses.evidence import SAME_STRUCTURE, color_distance, correlation_of, exceeding
 
-LEAST = 0.2
-"""Weight of pixels with another structure, so that a photo of which nothing is known yet has a light."""
+LEAST = 0.05
+"""Smallest weight, so that a photo of which nothing is known yet has a light."""
+ROUNDS, OUTLIER = 3, 0.05
+"""Iterations of reweighted least squares for gain and offset, and the residual at which a weight is halved."""
+RIDGE = 3e-4
+"""Ridge regularisation towards a gain of 1, in units of squared colour."""
 
 
 @torch.no_grad()
 def likeness(
-    photo: Float[Tensor, "*pixels 3"],
-    render: Float[Tensor, "*pixels 3"],
-    pixels: tuple[Int[Tensor, " P"], Int[Tensor, " P"]] | None,
-    height: int,
-    width: int,
-) -> Float[Tensor, "*pixels"]:
-    """Weights of pixels in a fit of the light, from `LEAST` to 1.
-
-    They increase linearly with the correlation of grey values up to `SAME_STRUCTURE`.
-
-    Args:
-        photo: RGB in [0, 1]; all pixels, or a sample.
-        render: The render, under any light.
-        pixels: Rows and columns of the sample, whose pixels are compared within each tile of the rasteriser; None
-            for all, each of which is compared in a window around it.
-        height: Height of the photo.
-        width: Width of the photo.
-    """
-    if pixels is None:
-        correlation = structural_correlation(photo, render)
-    else:
-        correlation = _tile_correlation(photo, render, pixels, height, width)
-    return LEAST + (1 - LEAST) * (correlation / SAME_STRUCTURE).clamp(0, 1)
-
-
-def _tile_correlation(
     photo: Float[Tensor, "P 3"],
     render: Float[Tensor, "P 3"],
-    pixels: tuple[Int[Tensor, " P"], Int[Tensor, " P"]],
-    height: int,
-    width: int,
+    weights: Float[Tensor, " P"],
+    tiles: Int[Tensor, " P"],
+    count: int,
 ) -> Float[Tensor, " P"]:
-    """Correlation of grey values in the tile of each pixel; both are assumed to share noise of `FLAT`."""
-    rows, columns = -(-height // TILE), -(-width // TILE)
-    tiles = pixels[0] // TILE * columns + pixels[1] // TILE
-    p, r = photo.mean(dim=1), render.clamp(0, 1).mean(dim=1)
-    p, r = p - p.mean(), r - r.mean()  # for the precision of differences of squares
-    values = torch.stack([torch.ones_like(p), p, r, p.square(), r.square(), p * r], dim=1)
-    sums = values.new_zeros(rows * columns, 6).index_add_(0, tiles, values)
-    mean_p, mean_r, square_p, square_r, product = (sums[:, 1:] / sums[:, :1].clamp_min(1)).unbind(dim=1)
-    variance_p = (square_p - mean_p.square()).clamp_min(0) + FLAT**2
-    variance_r = (square_r - mean_r.square()).clamp_min(0) + FLAT**2
-    correlation = (product - mean_p * mean_r + FLAT**2) / (variance_p * variance_r).sqrt()
-    return correlation[tiles]
+    """Factors on the weights of pixels in a fit of the light, from `LEAST` to 1, the same within a tile.
+
+    They are low where a tile differs in structure (correlation of grey values below `SAME_STRUCTURE`) and, after
+    gain and offset of each channel, in colour: trees and water differ in structure without being something else.
+
+    Args:
+        photo: RGB in [0, 1] of a sample of pixels.
+        render: The render without light codes.
+        weights: Weights of the pixels, 0 for those that do not count.
+        tiles: Index of each pixel's tile.
+        count: Number of tiles.
+    """
+    render = render.clamp(0, 1)
+    difference = photo - _matched(photo, render, weights)
+    grey = torch.stack([photo, render], dim=1).mean(dim=2)
+    p, r = (grey - 0.5).unbind(dim=1)  # for the precision of differences of squares
+    values = torch.stack([*difference.unbind(dim=1), p, r, p.square(), r.square(), p * r])
+    counted = (weights > 0).to(photo.dtype)
+    sums = values.new_zeros(len(values) + 1, count)
+    sums.index_add_(1, tiles, torch.cat([values, torch.ones_like(p)[None]]) * counted)
+    means = sums[:-1] / sums[-1].clamp_min(1)
+    distance = color_distance(means[:3], dim=0)[0, tiles]
+    usual = torch.where(weights > 0, distance, torch.nan).nanmedian()
+    strange = exceeding(distance, usual).nan_to_num(0.0)
+    unlike = 1 - (correlation_of(means[3:])[tiles] / SAME_STRUCTURE).clamp(0, 1)
+    return 1 - (1 - LEAST) * strange * unlike
+
+
+def _matched(
+    photo: Float[Tensor, "P 3"], render: Float[Tensor, "P 3"], weights: Float[Tensor, " P"]
+) -> Float[Tensor, "P 3"]:
+    """The render with gain and offset of each channel, by robust least squares."""
+    matched, trusted = render, weights
+    for _ in range(ROUNDS):
+        share = (trusted / trusted.sum().clamp_min(1e-6))[:, None]
+        means = (share * photo).sum(dim=0), (share * render).sum(dim=0)
+        p, r = photo - means[0], render - means[1]
+        gain = ((share * p * r).sum(dim=0) + RIDGE) / ((share * r.square()).sum(dim=0) + RIDGE)
+        matched = means[0] + gain * r
+        trusted = weights / (1 + ((photo - matched).abs().mean(dim=1) / OUTLIER).square())
+    return matched
