@@ -13,7 +13,7 @@ from torch import Tensor
 
 from wildgs.losses.evidence import SAME_STRUCTURE, color_distance, correlation_of, exceeding
 
-LEAST = 0.05
+LEAST = 0.2
 """Smallest weight, so that a photo of which nothing is known yet has a light."""
 ROUNDS, OUTLIER = 3, 0.05
 """Iterations of reweighted least squares for gain and offset, and the residual at which a weight is halved."""
