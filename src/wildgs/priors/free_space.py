@@ -76,6 +76,8 @@ def find_foregrounds(scene: Scene, on_photo: Counter) -> dict[str, Float[Tensor,
             coming.prefetch()
         depths.append(_read(scene, view))
         on_photo(row + 1, len(views))
+    if not any(each is not None and each.prior.any() for each in depths):
+        return {}
     found = {}
     for view, mine, others in zip(views, depths, choose_neighbours(scene, NEIGHBOURS), strict=True):
         if mine is not None:
