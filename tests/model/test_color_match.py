@@ -234,27 +234,3 @@ def test_the_sky_that_a_photo_does_not_show_follows_the_one_it_shows() -> None:
     shown = torch.tensor([0.5, 0.6, 0.7])
     assert float((matched(shown, 0.375) - shown - 0.1).abs().max()) < 0.03
     assert float((matched(shown, 0.8) - shown).abs().max()) < 0.3
-
-
-def test_a_coach_is_no_light() -> None:
-    """Tiles that differ in colour and structure hardly count in training."""
-    generator = torch.Generator().manual_seed(0)
-    rows, across = (
-        each.flatten() for each in torch.meshgrid(torch.arange(96), torch.arange(96), indexing="ij")
-    )
-    render = torch.where(across // 4 % 2 == 0, 0.7, 0.4)[:, None].expand(-1, 3).contiguous()
-    codes = torch.stack([rows / 96 - 0.5, torch.rand(len(rows), generator=generator) - 0.5], dim=1)
-    tint = torch.tensor([0.2, 0.05, -0.1])
-    photo = 0.8 * render + codes[:, :1] * tint
-    coach = (rows >= 48) & (across >= 32) & (across < 96)
-    photo = torch.where(coach[:, None], torch.tensor([0.1, 0.8, 0.2]), photo)
-    picture = Rendering(render, torch.ones(len(rows)), torch.ones(len(rows)))
-    tiles = rows // 16 * 6 + across // 16
-
-    def error(tiles: tuple[torch.Tensor, int] | None) -> float:
-        found = match_photo(
-            photo, picture, None, None, threshold=0.0, sky=None, codes=codes, training=True, tiles=tiles
-        )
-        return float((found[:, 4] - tint).norm())
-
-    assert error((tiles, 36)) < 0.25 * error(None)

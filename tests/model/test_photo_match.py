@@ -10,7 +10,7 @@ import torch
 from wildgs.geometry.spherical_harmonics import C0
 from wildgs.model.config import SkyConfig, WildGSConfig
 from wildgs.model.method import Stage
-from wildgs.model.photo_match import PhotoMatch, Sight
+from wildgs.model.photo_match import PhotoMatch
 from wildgs.model.registry import restore_method
 from wildgs.model.sky import sine_of_elevation
 
@@ -102,25 +102,3 @@ def test_a_scene_without_light_codes_has_no_weights_of_them(light_codes: int) ->
     """An empty tensor instead would be on the CPU, also when training is on a GPU."""
     weights = PhotoMatch(WildGSConfig(light_codes=light_codes)).code_weights
     assert (weights is None) == (light_codes == 0)
-
-
-@pytest.mark.parametrize("training", [False, True])
-def test_what_the_user_masks_does_not_change_the_match(camera, make_wall_model, training: bool) -> None:
-    model = make_wall_model()
-    match, colors = (
-        model.photo_match,
-        torch.rand(len(model.gaussians), 3, generator=torch.Generator().manual_seed(0)),
-    )
-    values = torch.cat([colors, torch.zeros(len(colors), match.num_codes)], dim=1)
-    keep = torch.ones(camera.height, camera.width, dtype=torch.bool)
-    keep[:, : camera.width // 3] = False
-    drawn = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
-    found = []
-    for masked in (0.0, 1.0):
-        photo = torch.where(keep[..., None], 0.5 + 0.2 * drawn, masked * drawn)
-        sight = Sight(photo, model.gaussians.project(camera), None, keep)
-        torch.manual_seed(0)
-        picture = match.picture(sight.projection, values, model.centre, training=training)
-        found.append(match.find(sight, picture, training=training))
-    assert found[0].any()
-    torch.testing.assert_close(found[0], found[1], rtol=0, atol=0)

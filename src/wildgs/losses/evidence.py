@@ -79,28 +79,13 @@ def color_evidence(photo: Float[Tensor, "H W 3"], render: Float[Tensor, "H W 3"]
     side = max(1, round(max(height, width) / COLOR_CELLS))
     difference = (photo - render.clamp(0, 1)).permute(2, 0, 1)[None]
     cells = functional.avg_pool2d(difference, side, ceil_mode=True, count_include_pad=False)
-    distance = color_distance(cells, dim=1)
-    lit = (cells.mean(dim=1, keepdim=True) / LIT).clamp(0, 1) * _night(photo[::side, ::side])
-    evidence = MOST_EVIDENCE * exceeding(distance, distance.median()) * (1 - lit)
+    brightness = cells.mean(dim=1, keepdim=True)
+    hue = (cells - brightness).square().sum(dim=1, keepdim=True)
+    distance = (2 * (hue + BRIGHTNESS_SHARE * brightness.square())).sqrt()
+    fourth = (distance - distance.median()).clamp_min(0) ** 4
+    lit = (brightness / LIT).clamp(0, 1) * _night(photo[::side, ::side])
+    evidence = MOST_EVIDENCE * fourth / (fourth + HALF_EVIDENCE**4) * (1 - lit)
     return functional.interpolate(evidence, size=(height, width), mode="bilinear")[0, 0]
-
-
-def color_distance(difference: Float[Tensor, "..."], dim: int) -> Float[Tensor, "..."]:
-    """Length of differences of colours, with a lower weight on brightness.
-
-    Args:
-        difference: RGB along one axis.
-        dim: This axis, which is kept with a length of 1.
-    """
-    brightness = difference.mean(dim=dim, keepdim=True)
-    hue = (difference - brightness).square().sum(dim=dim, keepdim=True)
-    return (2 * (hue + BRIGHTNESS_SHARE * brightness.square())).sqrt()
-
-
-def exceeding(distance: Float[Tensor, "*batch"], usual: Float[Tensor, ""]) -> Float[Tensor, "*batch"]:
-    """How far distances of colours exceed the usual one, from 0 to 1; a half at `HALF_EVIDENCE`."""
-    fourth = (distance - usual).clamp_min(0) ** 4
-    return fourth / (fourth + HALF_EVIDENCE**4)
 
 
 def _night(photo: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
@@ -130,20 +115,12 @@ def structural_correlation(
     grey = grey - grey.mean(dim=(2, 3), keepdim=True)  # for the precision of differences of squares
     radius = max(1, round(max(grey.shape[2:]) / STRUCTURE_WINDOWS / 2))
     moments = _box_mean(torch.cat([grey, grey.square(), grey[:1] * grey[1:]]), radius)
-    correlation = correlation_of(moments[:, 0])
-    return functional.interpolate(correlation[None, None], size=(height, width), mode="bilinear")[0, 0]
-
-
-def correlation_of(moments: Float[Tensor, "5 *batch"]) -> Float[Tensor, "*batch"]:
-    """Correlation of grey values, both with noise of standard deviation `FLAT`.
-
-    Args:
-        moments: Means of p, r, p², r² and p r, of which p and r are near 0 on average for precision.
-    """
-    mean_p, mean_r, square_p, square_r, product = moments
+    mean_p, mean_r, square_p, square_r, product = moments[:, 0]
     variance_p = (square_p - mean_p.square()).clamp_min(0) + FLAT**2
     variance_r = (square_r - mean_r.square()).clamp_min(0) + FLAT**2
-    return (product - mean_p * mean_r + FLAT**2) / (variance_p * variance_r).sqrt()
+    covariance = product - mean_p * mean_r + FLAT**2
+    correlation = covariance / (variance_p * variance_r).sqrt()
+    return functional.interpolate(correlation[None, None], size=(height, width), mode="bilinear")[0, 0]
 
 
 def _box_mean(x: Float[Tensor, "B 1 H W"], radius: int) -> Float[Tensor, "B 1 H W"]:

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
 from wildgs.geometry.spherical_harmonics import rgb_to_sh0
-from wildgs.model.likeness import likeness
 from wildgs.model.sky import Sky
 from wildgs.model.wrapping import MIN_ALPHA, liftable
 from wildgs.rasterize import Rendering
@@ -83,7 +82,6 @@ def match_photo(
     sky: Sky | None,
     codes: Float[Tensor, "*pixels L"],
     training: bool = False,
-    tiles: tuple[Int[Tensor, "*pixels"], int] | None = None,
 ) -> Float[Tensor, "3 M"]:
     """Fits the colour transform from a render to its photo, separately for the landmark and the sky.
 
@@ -98,8 +96,6 @@ def match_photo(
         sky: Sky pixels; None fits one transform for all pixels.
         codes: Rendered light codes of the landmark, on which its transform depends linearly; L may be 0.
         training: Fit a gain per channel (a diagonal A) only.
-        tiles: Tiles of the pixels of a sample, and their number; the landmark's pixels are then weighted by
-            `wildgs.model.likeness`.
 
     Returns:
         Transform [A | b | W] of the landmark: colours c become ``c + A c + b + W codes``; with a sky, followed by
@@ -110,12 +106,8 @@ def match_photo(
     if keep is not None:
         static, covered = static & keep, covered & keep
     weights = static.float() if visibility is None else visibility * static
-    if sky is not None:
-        weights = weights * ~sky.which
-    if tiles is not None:
-        weights = weights * likeness(photo, rendering.colors, weights, *tiles)
     ones = torch.ones_like(weights)[..., None]
-    regions = [(weights, torch.cat([ones, codes], dim=-1))]
+    regions = [(weights if sky is None else weights * ~sky.which, torch.cat([ones, codes], dim=-1))]
     if sky is not None:
         elevated = torch.cat([ones, elevation_powers(sky.sine)], dim=-1)
         regions.append(((covered & sky.which).float(), elevated))

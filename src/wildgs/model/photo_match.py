@@ -34,7 +34,7 @@ from wildgs.model.config import WildGSConfig
 from wildgs.model.gaussians import Gaussians, spread_rows
 from wildgs.model.sky import Sky, find_sky, sine_of_elevation
 from wildgs.model.wrapping import liftable
-from wildgs.rasterize import TILE, Projection, Rendering, blend, blend_sample
+from wildgs.rasterize import Projection, Rendering, blend, blend_sample
 
 MATCH_TILES, MATCH_EVERY = 40, 3
 """In training, number of tiles that are rendered for the match, and stride of the pixels used in them."""
@@ -183,7 +183,6 @@ class PhotoMatch(nn.Module):
             sky=picture.sky,
             codes=picture.codes,
             training=training,
-            tiles=None if picture.pixels is None else _tiles(picture.pixels, *sight.photo.shape[:2]),
         )
 
     def matched(
@@ -288,12 +287,6 @@ class PhotoMatch(nn.Module):
             return None
         response = self.config.matched_loss * self.response(sight, rendering, training=True)
         return responded(rendering.colors, squared_radius(sight.projection.camera), response)
-
-
-def _tiles(pixels: tuple[Tensor, Tensor], height: int, width: int) -> tuple[Int[Tensor, " P"], int]:
-    """The rasteriser's tile of each sampled pixel of a photo, and the number of tiles."""
-    columns = -(-width // TILE)
-    return pixels[0] // TILE * columns + pixels[1] // TILE, -(-height // TILE) * columns
 
 
 def _resized(values: Float[Tensor, "H W *C"], height: int, width: int) -> Float[Tensor, "h w *C"]:

@@ -8,11 +8,10 @@ from wildgs.rasterize.dispatch import (
     rasterize,
     sh_to_colors,
 )
-from wildgs.rasterize.interface import EPS2D, TILE, BackendName, Projection, Rendering
+from wildgs.rasterize.interface import EPS2D, BackendName, Projection, Rendering
 
 __all__ = [
     "EPS2D",
-    "TILE",
     "BackendName",
     "Projection",
     "Rendering",
