@@ -122,3 +122,16 @@ def test_a_name_that_is_not_utf8_is_printed_with_escapes(
         monkeypatch.setattr(sys, "stdout", stream)
         screen.console.print(os.fsdecode(b"caf\xe9.jpg"))
     assert (tmp_path / "out").read_text() == "caf\\udce9.jpg\n"
+
+
+def test_long_stages_print_a_line_a_minute_into_files(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(screen.time, "monotonic", lambda: clock[0])
+    with screen.progress_shown() as show:
+        for done in range(8):
+            clock[0] = 25.0 * done
+            show("finding poses", done, 7)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["finding poses: 3 of 7", "finding poses: 6 of 7", "finding poses: 7 done"]

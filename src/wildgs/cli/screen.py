@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from wildgs.library.pipeline import FinishedRun
     from wildgs.light.look import Look
 
-LINE_SECONDS = 10.0
+LINE_SECONDS, STAGE_SECONDS = 10.0, 60.0
+"""Intervals of lines in files and pipes, in training and in other stages, which may take many minutes."""
 REFRESH_STEPS = 10
 NAME_WIDTH = 8
 """Least width of a table's column of names in characters."""
@@ -146,8 +147,8 @@ class Screen:
             )
         elif self._detail:
             self._line(done, total)
-        elif total and done == total and not stage.startswith("training"):
-            console.print(f"{stage}: {total} done")
+        elif total and not stage.startswith("training"):
+            self._stage_line(done, total)
         if total and done == total:
             self.close()
 
@@ -175,6 +176,14 @@ class Screen:
             self._bar.start()
         elif stage.startswith("training") and done < total:
             console.print(f"{stage}: {total - done} steps")
+
+    def _stage_line(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done == total:
+            console.print(f"{self._stage}: {total} done")
+        elif now - self._last_line >= STAGE_SECONDS:
+            self._last_line = now
+            console.print(f"{self._stage}: {done} of {total}")
 
     def _line(self, done: int, total: int) -> None:
         now = time.monotonic()
