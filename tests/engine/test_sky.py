@@ -159,6 +159,20 @@ def test_the_sky_of_a_photo_is_found_once_and_only_where_it_is_used(
     assert len(calls) == found
 
 
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_sky_is_static_where_a_depth_prior_tells_it_from_walls(
+    scene: Scene, model: WildGSConfig, monkeypatch: pytest.MonkeyPatch, with_prior: bool
+) -> None:
+    prior = torch.zeros(HEIGHT, WIDTH) if with_prior else None
+    monkeypatch.setattr(feed, "aligned_depth", lambda *arguments: (None, prior))
+    photos = trainer_for(scene, model, 1).feed
+    view = scene.train_views[0]
+    sky, static = photos.sky(view), photos.static_sky(view)
+    assert sky.any()
+    assert (static is not None) == with_prior
+    assert static is None or torch.equal(static, sky)
+
+
 def test_gaussians_do_not_grow_in_the_sky(
     scene: Scene, model: WildGSConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

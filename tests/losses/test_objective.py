@@ -181,16 +181,18 @@ def test_depth_in_front_of_the_sky_is_penalised_by_its_nearness() -> None:
     assert depth.grad.tolist() == [[pytest.approx(-0.0625), pytest.approx(-0.0625)], [0.0, 0.0]]
 
 
-def test_sky_is_static() -> None:
+def test_what_is_known_to_be_static_is_not_hidden() -> None:
     photo = torch.rand(48, 48, 3, generator=torch.Generator().manual_seed(0))
     render = photo.clone()
     render[:, 16:32] = 1 - render[:, 16:32]
     visibility = torch.full((48, 48), 0.9, requires_grad=True)
-    sky = torch.zeros(48, 48, dtype=torch.bool)
-    sky[:16] = True
+    static = torch.zeros(48, 48, dtype=torch.bool)
+    static[:16] = True
     observations = torch.tensor([[24.5, 40.5]])
     config = ObjectiveConfig()
-    losses = total_loss(config, 0.0, photo, render, visibility=visibility, sky=sky, observations=observations)
+    losses = total_loss(
+        config, 0.0, photo, render, visibility=visibility, static=static, observations=observations
+    )
     losses.image.backward()
     gradient = visibility.grad
     assert gradient is not None

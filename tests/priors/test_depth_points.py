@@ -121,12 +121,13 @@ def test_depth_is_known_where_a_map_tells_it() -> None:
     metric = np.zeros((SIDE, SIDE), np.float32)
     metric[:4] = 1.0
     made = scene()
-    known = known_depth(made, with_photos(made.views[0], disparity=codes, depth=metric))
+    photo = with_photos(made.views[0], disparity=codes, depth=metric)
+    known = known_depth(aligned_depth(made, photo, torch.Generator()))
     assert known is not None
     expected = torch.ones(SIDE, SIDE, dtype=torch.bool)
     expected[4:8], expected[-8:] = False, False
     assert torch.equal(known, expected)
-    assert known_depth(made, with_photos(made.views[0], disparity=None)) is None
+    assert known_depth([None, None]) is None
 
 
 def test_disparity_that_is_noise_is_passed_over() -> None:

@@ -14,7 +14,7 @@ from wildgs.engine.device_cache import DeviceCache
 from wildgs.engine.team import Team
 from wildgs.errors import UserError, WildGSWarning
 from wildgs.geometry.camera import Camera
-from wildgs.priors.depth_points import known_depth
+from wildgs.priors.depth_points import aligned_depth, known_depth
 from wildgs.priors.sky_pixels import find_sky_pixels
 from wildgs.scene import Scene, View
 from wildgs.scene.image_cache import AHEAD
@@ -101,6 +101,7 @@ class PhotoFeed:
         self._unreadable: set[str] = set()
         self._cameras: dict[str, Camera] = {}
         self._sky: dict[str, Bool[Tensor, "_ _"]] = {}
+        self._with_prior: set[str] = set()
         self._kept = DeviceCache(device)
 
     def next_view(self) -> View:
@@ -168,11 +169,18 @@ class PhotoFeed:
         """Pixels of the photo that certainly show sky; found once at low resolution."""
         if view.name not in self._sky:
             assert self._scene is not None
-            known = known_depth(self._scene, view)
-            found = find_sky_pixels(view.read_photo(), view.camera, self._scene.points, known)
+            maps = aligned_depth(self._scene, view, torch.Generator())
+            found = find_sky_pixels(view.read_photo(), view.camera, self._scene.points, known_depth(maps))
             self._sky[view.name] = found.to(self.device)
+            if maps[1] is not None:
+                self._with_prior.add(view.name)
         small = self._sky[view.name].float()[None, None]
         return functional.interpolate(small, size=(view.camera.height, view.camera.width))[0, 0] > 0.5
+
+    def static_sky(self, view: View) -> Bool[Tensor, "H W"] | None:
+        """Pixels of `sky` if a depth prior tells them from plain walls nearby, such as arches; None without one."""
+        sky = self.sky(view)
+        return sky if view.name in self._with_prior else None
 
     def camera(self, view: View) -> Camera:
         """The camera, cached on the device."""

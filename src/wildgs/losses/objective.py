@@ -62,6 +62,7 @@ def total_loss(
     sky: Bool[Tensor, "H W"] | None = None,
     sky_depth: float = 0.0,
     observations: Float[Tensor, "K 2"] | None = None,
+    static: Bool[Tensor, "H W"] | None = None,
     train_mask: bool = True,
     mask_threshold: float = 0.5,
     num_photos: int | None = None,
@@ -85,6 +86,7 @@ def total_loss(
         sky: Pixels that certainly show sky; those that the user's mask leaves out are ignored.
         sky_depth: Rendered depth below which something is in front of the sky.
         observations: Pixels (x, y) at which the photo observes triangulated points, which are static.
+        static: Further pixels that are known to be static.
         train_mask: Whether the mask gets a gradient (False in the pause after an opacity reset).
         mask_threshold: Threshold Th of static pixels for the depth loss.
         num_photos: Number of training photos, on which λ^M depends; None for enough of them.
@@ -108,6 +110,7 @@ def total_loss(
         metric_depth=metric_depth,
         sky=sky,
         proven=None if observations is None else proven_static(observations, *photo.shape[:2]),
+        static=static,
         mask_threshold=mask_threshold,
         doubt=doubt,
         foreground=foreground,
@@ -129,6 +132,7 @@ def weighted_losses(
     metric_depth: Float[Tensor, "H W"] | None = None,
     sky: Bool[Tensor, "H W"] | None = None,
     proven: Bool[Tensor, "H W"] | None = None,
+    static: Bool[Tensor, "H W"] | None = None,
     mask_threshold: float = 0.5,
     doubt: Float[Tensor, "_ _"] | None = None,
     foreground: Float[Tensor, "_ _"] | None = None,
@@ -148,13 +152,15 @@ def weighted_losses(
         disparity: Monocular estimate.
         metric_depth: Depth in world units.
         sky: Pixels that certainly show sky.
-        proven: Pixels known to be static (`proven_static`), besides those that show sky.
+        proven: Pixels known to be static by observations (`proven_static`).
+        static: Further pixels known to be static.
         mask_threshold: Threshold Th.
         doubt: Degree to which pixels may be transient.
         foreground: Degree to which pixels are transient for another reason.
     """
-    static = proven if sky is None else sky if proven is None else sky | proven
-    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), static, doubt, foreground)
+    if static is not None:
+        proven = static if proven is None else static | proven
+    image = _image_loss(config, photo, render, _kept(visibility, keep, photo), proven, doubt, foreground)
     total, zero = image, image.new_zeros(())
     mask = depth_term = zero
     if visibility is not None:

@@ -8,7 +8,7 @@ passers-by.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -158,15 +158,14 @@ def aligned_depth(
     return metric, aligned
 
 
-def known_depth(scene: Scene, view: View) -> Bool[Tensor, "H W"] | None:
-    """Pixels of which a depth map of the photo tells the depth; None without usable depth maps.
+def known_depth(maps: Iterable[Float[Tensor, "H W"] | None]) -> Bool[Tensor, "H W"] | None:
+    """Pixels of which at least one depth map of a photo tells the depth; None without maps.
 
     Args:
-        scene: The scene, to whose sparse points disparity is aligned.
-        view: The photo.
+        maps: From `aligned_depth`.
     """
-    maps = [depth > 0 for depth in aligned_depth(scene, view, torch.Generator()) if depth is not None]
-    return reduce(torch.logical_or, maps) if maps else None
+    known = [depth > 0 for depth in maps if depth is not None]
+    return reduce(torch.logical_or, known) if known else None
 
 
 def _align(
