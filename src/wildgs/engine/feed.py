@@ -177,10 +177,9 @@ class PhotoFeed:
         small = self._sky[view.name].float()[None, None]
         return functional.interpolate(small, size=(view.camera.height, view.camera.width))[0, 0] > 0.5
 
-    def static_sky(self, view: View) -> Bool[Tensor, "H W"] | None:
-        """Pixels of `sky` if a depth prior tells them from plain walls nearby, such as arches; None without one."""
-        sky = self.sky(view)
-        return sky if view.name in self._with_prior else None
+    def tells_sky_from_walls(self, view: View) -> bool:
+        """Whether a depth prior told the photo's `sky` from plain walls nearby, such as arches."""
+        return view.name in self._with_prior
 
     def camera(self, view: View) -> Camera:
         """The camera, cached on the device."""

@@ -295,7 +295,7 @@ class Trainer:
             sky=sky,
             sky_depth=self.method.sky_depth,
             observations=self.feed.observations(view),
-            static=None if sky is None else self.feed.static_sky(view),
+            static=sky if self.feed.tells_sky_from_walls(view) else None,
             train_mask=stage.learn_mask,
             mask_threshold=self.method.mask_threshold,
             num_photos=len(self.views),
