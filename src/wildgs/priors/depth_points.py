@@ -109,7 +109,7 @@ def _subsample(views: Sequence[View]) -> list[View]:
     return [views[round(index)] for index in torch.linspace(0, len(views) - 1, MAX_PHOTOS).tolist()]
 
 
-def _sample_at(
+def sample_at(
     points: Float[Tensor, "P 3"], camera: Camera, picture: Float[Tensor, "h w"], step: int = 1
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
     """Depth of each point, and the value of an image (of every `step`-th pixel) at its pixel; 0 outside."""
@@ -176,7 +176,7 @@ def _align(
     generator: torch.Generator,
 ) -> Float[Tensor, "H W"] | None:
     """Converts disparity to depth by a fit to the photo's points and metric depth; None if the fit fails."""
-    z, sampled = _sample_at(points, camera, disparity)
+    z, sampled = sample_at(points, camera, disparity)
     z, sampled = z[sampled > 0], sampled[sampled > 0]
     if metric is not None:
         both = (metric > 0) & (disparity > 0)
@@ -284,6 +284,6 @@ def _contradictions(
     """Number of photos whose depth at each point lies clearly behind it."""
     count = torch.zeros(len(points), dtype=torch.int64)
     for photo in photos:
-        z, depth = _sample_at(points, photo.camera, photo.depth, photo.step)
+        z, depth = sample_at(points, photo.camera, photo.depth, photo.step)
         count += depth > (1 + 2 * _TOLERANCE) * z + cell
     return count

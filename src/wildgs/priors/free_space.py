@@ -16,7 +16,7 @@ from torch import Tensor
 
 from wildgs.errors import UserError
 from wildgs.geometry.camera import Camera
-from wildgs.priors.depth_points import aligned_depth
+from wildgs.priors.depth_points import aligned_depth, sample_at
 from wildgs.priors.stereo.neighbours import choose_neighbours
 from wildgs.progress import Counter
 from wildgs.scene.scene import Scene, View
@@ -101,8 +101,8 @@ def _read(scene: Scene, view: View) -> _Depths | None:
     none = torch.zeros(view.camera.height, view.camera.width)
     metric, prior = (none if depth is None else depth for depth in maps)
     step = -(-max(none.shape) // SIDE)
-    known = torch.where(metric > 0, metric, prior)[::step, ::step].contiguous()
-    prior = torch.where(metric > 0, 0.0, prior)[::step, ::step].contiguous()
+    metric, prior = metric[::step, ::step], prior[::step, ::step].contiguous()
+    known = torch.where(metric > 0, metric, prior)
     return _Depths(view.camera.resized(known.shape[1], known.shape[0]), prior, known)
 
 
@@ -111,12 +111,8 @@ def _foreground(mine: _Depths, others: list[_Depths]) -> Float[Tensor, "h w"]:
     points = mine.camera.unproject(mine.prior).flatten(0, 1)
     through, same = torch.zeros(len(points)), torch.zeros(len(points))
     for other in others:
-        pixels, z = other.camera.project(points)
-        inside = (z > 0) & (pixels >= 0).all(dim=1)
-        x, y = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
-        inside &= (x < other.camera.width) & (y < other.camera.height)
-        depth = other.known[y.clamp_max(other.camera.height - 1), x.clamp_max(other.camera.width - 1)]
-        ratio = torch.where(inside & (depth > 0), depth / z, 0.0)
+        z, depth = sample_at(points, other.camera, other.known)
+        ratio = torch.where(depth > 0, depth / z, 0.0)
         through += ratio > THROUGH
         same += (ratio - 1).abs() < AGREEING
     share = through / (through + same).clamp_min(1)
