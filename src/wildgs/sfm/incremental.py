@@ -134,6 +134,20 @@ def measure_distortion(work: Workplace, model: Any, count: int) -> None:
         _finish(model, _priors(work), USUAL_SHIFT)
 
 
+def adjust_robustly(work: Workplace, model: Any, count: int, constant: Collection[int] = ()) -> None:
+    """Adjusts poses, points and lenses of a finished model with a robust loss, and filters its observations.
+
+    Args:
+        work: The workplace.
+        model: The model; modified.
+        count: Number of all photos.
+        constant: Ids of cameras whose lenses stay as they are.
+    """
+    priors = _priors(work) if count <= PRIORS_LIMIT else {}
+    spread = WIDE_SHIFT if is_wide(model) else USUAL_SHIFT
+    _finish(model, priors, spread, constant, robust=True)
+
+
 def is_wide(model: Any) -> bool:
     """Whether a model was found with strongly distorted photos.
 
@@ -156,8 +170,12 @@ def _finish(
     priors: Mapping[int, LensPrior],
     spread: float | None,
     constant: Collection[int] = (),
+    *,
+    robust: bool = False,
 ) -> None:
-    adjust_with_priors(model, priors, corner_shift=spread, constant=constant, rounds=LAST_ROUNDS)
+    adjust_with_priors(
+        model, priors, corner_shift=spread, constant=constant, rounds=LAST_ROUNDS, robust=robust
+    )
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
 
 

@@ -46,6 +46,16 @@ ROUNDS, CONVERGED = 3, 0.01
 ITERATIONS = 30
 """Upper bound on iterations of the solver in a round."""
 
+ROBUST_SCALE = 1.0
+"""Error from which the robust loss grows more slowly than the squared one, pixels."""
+
+SMALL_RESIDUAL, MOST_COPIES = 0.4, 100
+"""Largest residual of a pseudo-observation of a focal length, pixels, which is divided among so many copies, and
+upper bound on their number. A robust loss would take a large one for a wrong match."""
+
+RING_COPIES = 4
+"""Number of observations of each point of the rings."""
+
 RING = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 INNER = 0.5
 """Directions of a ring's points, and the radius of the inner ring relative to the outer one."""
@@ -78,23 +88,25 @@ def adjust_with_priors(
     corner_shift: float | None,
     constant: Collection[int] = (),
     rounds: int = ROUNDS,
+    robust: bool = False,
 ) -> None:
     """Adjusts poses, points and lenses of a model in place.
 
     Args:
         model: pycolmap's reconstruction with two registered photos or more.
-        priors: Priors by camera id.
+        priors: Priors by camera id; lenses without one have none.
         corner_shift: Prior standard deviation of the displacement of a photo's corners by distortion, relative to
             their distance from the centre. None keeps distortion as it is.
         constant: Ids of cameras whose lenses stay as they are.
         rounds: Upper bound on the number of bundle adjustments.
+        robust: Whether the loss is that of Cauchy instead of the squared error.
     """
     photos = list(model.reg_image_ids())
     lenses = sorted({model.image(photo).camera_id for photo in photos} - set(constant))
     trial = pycolmap.Reconstruction(model)
     for _ in range(rounds):
         before = {lens: trial.camera(lens).mean_focal_length() for lens in lenses}
-        if not _adjust(trial, photos, lenses, priors, constant, corner_shift):
+        if not _adjust(trial, photos, lenses, priors, constant, corner_shift, robust):
             return
         changes = [abs(math.log(trial.camera(lens).mean_focal_length() / before[lens])) for lens in lenses]
         if max(changes, default=0.0) < CONVERGED:
@@ -109,6 +121,7 @@ def _adjust(
     priors: Mapping[int, LensPrior],
     constant: Collection[int],
     corner_shift: float | None,
+    robust: bool,
 ) -> bool:
     """One bundle adjustment with pseudo-observations; returns whether its solution is usable."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -119,6 +132,8 @@ def _adjust(
     pseudo = _PseudoObservations(trial, config)
     for lens in lenses:
         camera = trial.camera(lens)
+        if lens not in priors:
+            continue
         pseudo.observe_focal_length(camera, priors[lens])
         if corner_shift is not None and camera.model_name == "SIMPLE_RADIAL":
             pseudo.observe_distortion(camera, corner_shift)
@@ -127,6 +142,9 @@ def _adjust(
     options.print_summary = False
     options.refine_extra_params = corner_shift is not None
     options.ceres.solver_options.max_num_iterations = ITERATIONS
+    if robust:
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = ROBUST_SCALE
     summary = pycolmap.create_default_bundle_adjuster(options, config, trial).solve()
     pseudo.remove()
     lengths = [trial.camera(lens).mean_focal_length() for lens in lenses]
@@ -144,11 +162,12 @@ class _PseudoObservations:
     def observe_focal_length(self, camera: Any, prior: LensPrior) -> None:
         """Adds a residual in the focal length whose gradient is that of the prior at the present value."""
         focal = camera.mean_focal_length()
-        target = focal * (1 - math.log(focal / prior.focal))
-        tangent = RESIDUAL / (prior.spread * focal)
+        deviation = math.log(focal / prior.focal) / prior.spread
+        target = focal * (1 - deviation * prior.spread)
         # COLMAP's bundle adjustment needs two observations of a point.
-        points = np.array([[tangent / math.sqrt(2), 0.0]])
-        self._add(camera, points, points * target, copies=2, constant=True)
+        copies = min(max(2, math.ceil((RESIDUAL * deviation / SMALL_RESIDUAL) ** 2)), MOST_COPIES)
+        points = np.array([[RESIDUAL / (prior.spread * focal) / math.sqrt(copies), 0.0]])
+        self._add(camera, points, points * target, copies=copies, constant=True)
 
     def observe_distortion(self, camera: Any, corner_shift: float) -> None:
         """Adds residuals in the distortion alone, whose prior has mean 0."""
@@ -157,10 +176,11 @@ class _PseudoObservations:
         # Information about the coefficient in N points of two rings of radius a and INNER a, after the distance
         # from their plane is eliminated: N f^2 a^6 times this number. It should be (RESIDUAL / its deviation)^2.
         left = 1 + INNER**6 - (1 + INNER**4) ** 2 / (1 + INNER**2)
-        outer = (RESIDUAL**2 / (corner_shift**2 * left * 2 * len(RING) * diagonal**2)) ** (1 / 6)
+        number = RING_COPIES * len(RING)
+        outer = (RESIDUAL**2 / (corner_shift**2 * left * number * diagonal**2)) ** (1 / 6)
         radius = outer * diagonal / focal
         points = radius * np.concatenate([RING, INNER * RING])
-        self._add(camera, points, points * focal, copies=2, constant=False)
+        self._add(camera, points, points * focal, copies=RING_COPIES, constant=False)
 
     def _add(
         self, camera: Any, points: np.ndarray, offsets: np.ndarray, *, copies: int, constant: bool

@@ -150,7 +150,7 @@ def continue_mapping(
     options = pipeline_options(config)
     options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
     options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
-    constant = _lenses(work, constant_lenses)
+    constant = lenses_of(work, constant_lenses)
     options.constant_cameras = options.mapper.constant_cameras = constant
     options.multiple_models = False
     next_photo = _counted(progress, model.num_reg_images(), count)
@@ -158,7 +158,8 @@ def continue_mapping(
     return models[0] if models and models[0].num_reg_images() >= model.num_reg_images() else model
 
 
-def _lenses(work: Workplace, names: Collection[str]) -> set[int]:
+def lenses_of(work: Workplace, names: Collection[str]) -> set[int]:
+    """Ids of the cameras of working copies."""
     with closing(pycolmap.Database.open(work.database)) as database:
         return {image.camera_id for image in database.read_all_images() if image.name in names}
 

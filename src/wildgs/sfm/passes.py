@@ -19,6 +19,7 @@ from wildgs.sfm.lenses import drop_impossible
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import (
     continue_mapping,
+    lenses_of,
     map_photos,
     map_repeatedly,
     missing_from,
@@ -27,6 +28,7 @@ from wildgs.sfm.matching import describe_photos, extract, forget_pairs, match, m
 from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, friends_of_friends
 from wildgs.sfm.placement import Findings, PassName, count_neighbours, find_groups
 from wildgs.sfm.point_matching import match_to_points
+from wildgs.sfm.refinement import refine
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -85,6 +87,8 @@ def find_poses(
     if not models:
         return None
     measure_distortion(work, models[0], len(copies))
+    again = counter(progress, "matching along epipolar lines")
+    models[0] = refine(work, models[0], len(copies), config, again)
     lenses = drop_impossible(models[0])
     if lenses and config.second_chance:
         models[0] = place_with_plain_lens(
@@ -233,7 +237,8 @@ def place_with_plain_lens(
     after = continue_mapping(work, model, len(copies), config, progress, constant_lenses=names)
     _note_new(model, after, passes, "second")
     drop_unsure(after, work, passes)
-    return after
+    again = counter(progress, "matching along epipolar lines")
+    return refine(work, after, len(copies), config, again, lenses_of(work, names))
 
 
 def _more_pairs(

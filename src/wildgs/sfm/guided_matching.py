@@ -1,0 +1,190 @@
+"""Matches features of photos whose cameras are known along epipolar lines (guided matching).
+
+Lowe's ratio test compares the best match of a feature with the second best anywhere in the other photo, which
+repeated architecture makes nearly as similar. Once cameras are known, the second best near the epipolar line is
+another one. COLMAP's guided matching does the same, but takes several times as long on a CPU, and features of other
+sizes at the place of the best match for the second best.
+
+Source: Hartley and Zisserman, "Multiple view geometry in computer vision", 2004, section 11.6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt32
+from scipy.sparse import csr_array
+
+from wildgs.progress import Counter as Progressed
+
+ImagePair = tuple[int, int]
+"""Ids of two images, the smaller one first."""
+
+Matches = Mapping[ImagePair, UInt32[np.ndarray, "_ 2"]]
+"""Indices of matched features by pair of images."""
+
+RATIO = 0.7
+"""Lowe's ratio: largest angle between descriptors of a match relative to the second smallest."""
+
+LARGEST_ANGLE = 0.8
+"""Largest angle between descriptors of a match, radians; unrelated descriptors have about 1.2."""
+
+SAME_PLACE = 3.0
+"""Distance up to which features are at one place, pixels: the same corner has several of different sizes."""
+
+BLOCK = 1024
+"""Features of the first photo that are compared with those of the second at a time, which limits memory."""
+
+CACHED_PHOTOS = 64
+"""Photos whose features are kept in memory, 5 MB each."""
+
+
+@dataclass(frozen=True)
+class _Features:
+    """Features of a registered photo.
+
+    Attributes:
+        descriptors: Unit vectors.
+        pixels: Positions.
+        rays: Directions in the camera's frame with z = 1.
+        reach: Tangent of the angle within which features are near an epipolar line.
+    """
+
+    descriptors: Float32[np.ndarray, "F 128"]
+    pixels: Float64[np.ndarray, "F 2"]
+    rays: Float64[np.ndarray, "F 3"]
+    reach: float
+
+
+def neighbours(model: Any, most: int, least_shared: int) -> list[ImagePair]:
+    """Pairs of each image with those that share most points with it.
+
+    Args:
+        model: pycolmap's reconstruction.
+        most: Upper bound on the pairs of an image.
+        least_shared: Smallest number of points that a pair shares.
+    """
+    photos = np.array(sorted(model.reg_image_ids()))
+    rows = [
+        np.unique([element.image_id for element in model.point3D(point).track.elements])
+        for point in sorted(model.point3D_ids())
+    ]
+    if not rows:
+        return []
+    points = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    seen = csr_array(
+        (np.ones(len(points), np.int64), (np.searchsorted(photos, np.concatenate(rows)), points)),
+        shape=(len(photos), len(rows)),
+    )
+    shared = (seen @ seen.T).toarray()
+    np.fill_diagonal(shared, 0)
+    nearest = np.argsort(-shared, axis=1, kind="stable")[:, :most]
+    return sorted(
+        {
+            (int(photos[min(row, other)]), int(photos[max(row, other)]))
+            for row, others in enumerate(nearest)
+            for other in others
+            if shared[row, other] >= least_shared
+        }
+    )
+
+
+def match_guided(
+    model: Any, database: Any, pairs: Sequence[ImagePair], reach: float, progress: Progressed
+) -> dict[ImagePair, UInt32[np.ndarray, "_ 2"]]:
+    """Matches pairs of photos along epipolar lines.
+
+    Args:
+        model: pycolmap's reconstruction, in which the photos have poses.
+        database: COLMAP's database with their features.
+        pairs: Pairs to match.
+        reach: Largest distance of a match from the epipolar line, relative to the longer side.
+        progress: Called with (pairs matched, total number of pairs).
+
+    Returns:
+        The matches of each pair. A feature has at most one match in another photo.
+    """
+
+    @lru_cache(maxsize=CACHED_PHOTOS)
+    def features(photo: int) -> _Features:
+        return _read(model.image(photo), database, reach)
+
+    found = {}
+    for done, pair in enumerate(pairs, start=1):
+        found[pair] = _match(features(pair[0]), features(pair[1]), _essential(model, pair))
+        progress(done, len(pairs))
+    return found
+
+
+def _read(image: Any, database: Any, reach: float) -> _Features:
+    camera = image.camera
+    pixels = np.asarray(database.read_keypoints(image.image_id))[:, :2].astype(np.float64)
+    descriptors = np.asarray(database.read_descriptors(image.image_id).data).astype(np.float32)
+    descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
+    rays = np.concatenate([camera.cam_from_img(pixels), np.ones((len(pixels), 1))], axis=1)
+    side = max(camera.width, camera.height)
+    return _Features(descriptors, pixels, rays, reach * side / camera.mean_focal_length())
+
+
+def _essential(model: Any, pair: ImagePair) -> Float64[np.ndarray, "3 3"]:
+    """The essential matrix that maps rays of the first photo to epipolar lines in the second."""
+    first, second = (model.image(photo).cam_from_world() for photo in pair)
+    motion = second * first.inverse()
+    x, y, z = motion.translation
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion.rotation.matrix()
+
+
+def _match(
+    first: _Features, second: _Features, essential: Float64[np.ndarray, "3 3"]
+) -> UInt32[np.ndarray, "_ 2"]:
+    """Mutually best matches near epipolar lines that are clearly better than the second best elsewhere."""
+    lines, other_lines = first.rays @ essential.T, second.rays @ essential
+    limits = second.reach * np.hypot(lines[:, :1], lines[:, 1:2]).astype(np.float32)
+    other_limits = first.reach * np.hypot(other_lines[:, 0], other_lines[:, 1]).astype(np.float32)
+    found = []
+    for start in range(0, len(lines), BLOCK):
+        block = slice(start, start + BLOCK)
+        residuals = np.abs(lines[block].astype(np.float32) @ second.rays.T.astype(np.float32))
+        near = residuals < limits[block]
+        near &= residuals < other_limits
+        rows, columns = np.nonzero(near)
+        likeness = (first.descriptors[block] @ second.descriptors.T)[rows, columns]
+        found.append((rows + start, columns, np.arccos(np.minimum(likeness, 1))))
+    if not found:
+        return np.zeros((0, 2), np.uint32)
+    rows, columns, angles = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    clear = _is_clear(rows, columns, angles, second.pixels) & _is_clear(columns, rows, angles, first.pixels)
+    return np.stack([rows[clear], columns[clear]], axis=1).astype(np.uint32)
+
+
+def _is_clear(
+    owners: Int64[np.ndarray, " C"],
+    others: Int64[np.ndarray, " C"],
+    angles: Float32[np.ndarray, " C"],
+    pixels: Float64[np.ndarray, "F 2"],
+) -> np.ndarray:
+    """Which candidates are the best of their owner and pass the ratio test against those at other places.
+
+    Args:
+        owners: The feature that each candidate is for.
+        others: The feature of the other photo.
+        angles: Angles between their descriptors.
+        pixels: Positions of the other photo's features.
+    """
+    clear = np.zeros(len(owners), dtype=bool)
+    if not len(owners):
+        return clear
+    order = np.lexsort((angles, owners))
+    starts = np.flatnonzero(np.diff(owners[order], prepend=-1))
+    best = order[starts]
+    lengths = np.diff(np.append(starts, len(order)))
+    winners = np.repeat(best, lengths)
+    elsewhere = np.linalg.norm(pixels[others[order]] - pixels[others[winners]], axis=1) > SAME_PLACE
+    rivals = np.where(elsewhere, angles[order], np.float32(np.pi / 2))
+    second = np.minimum.reduceat(rivals, starts)
+    clear[best] = (angles[best] < LARGEST_ANGLE) & (angles[best] < RATIO * second)
+    return clear

@@ -1,0 +1,152 @@
+"""The last adjustment of cameras: with more matches, without those that two photos alone show, and a robust loss.
+
+Incremental mapping ends with cameras that are less exact than the photos allow, for three reasons:
+
+- Points of two photos are rarely right. COLMAP makes them of features that further photos matched but do not
+  confirm, and nothing but the epipolar line speaks against a wrong match. Here, they do not move cameras.
+- Bundle adjustment minimises squared errors, to which a wrong match of 4 pixels contributes as much as 64 right
+  ones of half a pixel. Here, its loss is that of Cauchy, under which it contributes as much as 13, as proposed by
+  Triggs et al., "Bundle adjustment: a modern synthesis", Vision Algorithms 1999.
+- Lowe's test rejects most right matches of repeated architecture. Once cameras are known, photos are matched again
+  along epipolar lines (`wildgs.sfm.guided_matching`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from wildgs.progress import Counter as Progressed
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.guided_matching import Matches, match_guided, neighbours
+from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
+from wildgs.sfm.workplace import Workplace
+
+REACH = 0.003
+"""Largest distance of guided matches from the epipolar line, relative to the longer side."""
+
+NEIGHBOURS, LEAST_SHARED = 5, 3
+"""Photos with which each one is matched again, those that share most points, and the smallest number of these."""
+
+CONFIRMED = 3
+"""Number of photos from which a point moves cameras."""
+
+LEAST_CONFIRMED = 20
+"""Number of observations of confirmed points below which a photo needs its other points as well."""
+
+LEAST_KEPT = 0.9
+"""Share of the observations from verified matches that adjusted cameras have to explain. A scene may become deeper
+until its points are too far away to be triangulated."""
+
+
+def refine(
+    work: Workplace,
+    model: Any,
+    count: int,
+    config: SfmConfig,
+    progress: Progressed,
+    constant: Collection[int] = (),
+) -> Any:
+    """Matches the photos of a finished model again, triangulates its points anew and adjusts everything.
+
+    Args:
+        work: The workplace; its database contains features and verified matches.
+        model: The model; not modified.
+        count: Number of all photos.
+        config: Options.
+        progress: Called with (pairs matched again, total number of pairs).
+        constant: Ids of cameras whose lenses stay as they are.
+
+    Returns:
+        A model with the same photos.
+    """
+    verified = verified_matches(work, model)
+    known = triangulate(model, verified, config)
+    first = _adjusted(work, known, verified, count, config, constant)
+    if first is None:
+        return known
+    matches = with_guided_matches(work, first, verified, progress)
+    second = _adjusted(work, triangulate(first, matches, config), verified, count, config, constant)
+    return triangulate(first if second is None else second, matches, config)
+
+
+def _adjusted(
+    work: Workplace, model: Any, verified: Matches, count: int, config: SfmConfig, constant: Collection[int]
+) -> Any | None:
+    """The model with adjusted cameras and points from verified matches; None if these are much fewer."""
+    adjusted = pycolmap.Reconstruction(model)
+    for point in unconfirmed(adjusted):
+        adjusted.delete_point3D(point)
+    adjust_robustly(work, adjusted, count, constant)
+    before, after = (triangulate(each, verified, config) for each in (model, adjusted))
+    kept = after.compute_num_observations() >= LEAST_KEPT * before.compute_num_observations()
+    return after if kept else None
+
+
+def verified_matches(work: Workplace, model: Any) -> Matches:
+    """The verified matches between photos of a model."""
+    registered = set(model.reg_image_ids())
+    found = {}
+    with closing(pycolmap.Database.open(work.database)) as database:
+        for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            if inliers and registered.issuperset(pair):
+                found[pair] = database.read_two_view_geometry(*pair).inlier_matches
+    return found
+
+
+def with_guided_matches(work: Workplace, model: Any, verified: Matches, progress: Progressed) -> Matches:
+    """Verified matches, and guided ones of features that have none in the other photo."""
+    pairs = neighbours(model, NEIGHBOURS, LEAST_SHARED)
+    with closing(pycolmap.Database.open(work.database)) as database:
+        guided = match_guided(model, database, pairs, REACH, progress)
+    found = dict(verified)
+    for pair, indices in guided.items():
+        known = found.get(pair, np.zeros((0, 2), np.uint32))
+        new = ~(np.isin(indices[:, 0], known[:, 0]) | np.isin(indices[:, 1], known[:, 1]))
+        found[pair] = np.concatenate([known, indices[new]])
+    return found
+
+
+def triangulate(model: Any, matches: Matches, config: SfmConfig) -> Any:
+    """A copy of a model with new points from matches; cameras stay as they are."""
+    options = pipeline_options(config).get_triangulation()
+    copy = pycolmap.Reconstruction(model)
+    for point in list(copy.point3D_ids()):
+        copy.delete_point3D(point)
+    graph = pycolmap.CorrespondenceGraph()
+    photos = sorted(copy.reg_image_ids())
+    for photo in photos:
+        graph.add_image(photo, copy.image(photo).num_points2D())
+    for (first, second), indices in matches.items():
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.inlier_matches = indices
+        graph.add_two_view_geometry(first, second, geometry)
+    graph.finalize()
+    observations = pycolmap.ObservationManager(copy, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, copy, observations)
+    for photo in photos:
+        triangulator.triangulate_image(options, photo)
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    observations.filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+    return copy
+
+
+def unconfirmed(model: Any) -> list[int]:
+    """Ids of the points of two photos, except those of photos that have few others."""
+    points = {point: model.point3D(point).track for point in model.point3D_ids()}
+    photos = {point: {element.image_id for element in track.elements} for point, track in points.items()}
+    confirmed = Counter(
+        photo for members in photos.values() if len(members) >= CONFIRMED for photo in members
+    )
+    return [
+        point
+        for point, members in photos.items()
+        if len(members) < CONFIRMED and min(confirmed[photo] for photo in members) >= LEAST_CONFIRMED
+    ]
