@@ -22,7 +22,7 @@ def test_a_photo_with_an_implausible_lens_is_placed_with_a_plain_one(
     model = map_photos(work, len(copies), config, silent, only=rest)[0]
     vlads = describe_photos(work, copies, 0)
     passes: dict[str, PassName] = {}
-    placed = place_with_plain_lens(work, copies, vlads, model, {name}, passes, config, silent)
+    placed = place_with_plain_lens(work, copies, vlads, model, {name}, {}, passes, config, silent)
     assert missing_from(placed, copies) == []
     assert passes == {name: "second"}
     lens = find_registered(placed, copies[LOST]).camera
@@ -37,7 +37,7 @@ def test_other_photos_are_not_tried(matched: tuple[Workplace, list[WorkingCopy]]
     rest = [copy.work_name for copy in copies[:LOST]]
     model = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
     vlads = describe_photos(work, copies, 0)
-    assert place_with_plain_lens(work, copies, vlads, model, {"no.jpg"}, {}, SfmConfig(), silent) is model
+    assert place_with_plain_lens(work, copies, vlads, model, {"no.jpg"}, {}, {}, SfmConfig(), silent) is model
 
 
 def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:

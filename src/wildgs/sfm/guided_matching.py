@@ -27,6 +27,8 @@ ImagePair = tuple[int, int]
 Matches = Mapping[ImagePair, UInt32[np.ndarray, "_ 2"]]
 """Indices of matched features by pair of images."""
 
+GuidedMatches = dict[ImagePair, UInt32[np.ndarray, "_ 2"]]
+
 RATIO = 0.7
 """Lowe's ratio: largest angle between descriptors of a match relative to the second smallest."""
 
@@ -95,7 +97,7 @@ def neighbours(model: Any, most: int, least_shared: int) -> list[ImagePair]:
 
 def match_guided(
     model: Any, database: Any, pairs: Sequence[ImagePair], reach: float, progress: Progressed
-) -> dict[ImagePair, UInt32[np.ndarray, "_ 2"]]:
+) -> GuidedMatches:
     """Matches pairs of photos along epipolar lines.
 
     Args:
@@ -113,7 +115,7 @@ def match_guided(
     def features(photo: int) -> _Features:
         return _read(model.image(photo), database, reach)
 
-    found = {}
+    found: GuidedMatches = {}
     for done, pair in enumerate(pairs, start=1):
         found[pair] = _match(features(pair[0]), features(pair[1]), _essential(model, pair))
         progress(done, len(pairs))

@@ -14,6 +14,7 @@ from torch import Tensor
 from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.enlarged import enlarge_small
+from wildgs.sfm.guided_matching import GuidedMatches
 from wildgs.sfm.incremental import LEAST_GROUP, by_size, measure_distortion
 from wildgs.sfm.lenses import drop_impossible
 from wildgs.sfm.lookalikes import find_doubtful
@@ -87,16 +88,38 @@ def find_poses(
     if not models:
         return None
     measure_distortion(work, models[0], len(copies))
-    again = counter(progress, "matching along epipolar lines")
-    models[0] = refine(work, models[0], len(copies), config, again)
+    guided: GuidedMatches = {}
+    models[0] = _refine(work, copies, vlads, models[0], guided, passes, config, progress)
     lenses = drop_impossible(models[0])
     if lenses and config.second_chance:
         models[0] = place_with_plain_lens(
-            work, copies, vlads, models[0], set(lenses), passes, config, progress
+            work, copies, vlads, models[0], set(lenses), guided, passes, config, progress
         )
         lenses |= drop_impossible(models[0])
         lenses = {name: why for name, why in lenses.items() if name not in _names(models[0])}
     return Poses(models, pairing, passes, Findings(crops, lenses))
+
+
+def _refine(
+    work: Workplace,
+    copies: Sequence[WorkingCopy],
+    vlads: Float[Tensor, "N D"],
+    model: Any,
+    guided: GuidedMatches,
+    passes: dict[str, PassName],
+    config: SfmConfig,
+    progress: Progress,
+) -> Any:
+    """The refined model, with photos that only its points, of which there are more, give a pose."""
+    again = counter(progress, "matching along epipolar lines")
+    refined = refine(work, model, len(copies), config, again, guided)
+    if not config.second_chance or not missing_from(refined, copies):
+        return refined
+    grown = _place_by_points(work, copies, vlads, [refined], passes, "second", config, progress)[0]
+    drop_unsure(grown, work, passes)
+    if not _names(grown) - _names(refined):
+        return refined
+    return refine(work, grown, len(copies), config, again, guided)
 
 
 def _try_again(
@@ -210,6 +233,7 @@ def place_with_plain_lens(
     vlads: Float[Tensor, "N D"],
     model: Any,
     names: Collection[str],
+    guided: GuidedMatches,
     passes: dict[str, PassName],
     config: SfmConfig,
     progress: Progress,
@@ -224,6 +248,7 @@ def place_with_plain_lens(
         vlads: VLAD descriptors of all photos.
         model: The model, without these photos.
         names: Names of their working copies.
+        guided: Guided matches of other photos; receives theirs.
         passes: Receives the pass of those registered.
         config: Options.
         progress: Called during matching and mapping.
@@ -238,7 +263,7 @@ def place_with_plain_lens(
     _note_new(model, after, passes, "second")
     drop_unsure(after, work, passes)
     again = counter(progress, "matching along epipolar lines")
-    return refine(work, after, len(copies), config, again, lenses_of(work, names))
+    return refine(work, after, len(copies), config, again, guided, lenses_of(work, names))
 
 
 def _more_pairs(

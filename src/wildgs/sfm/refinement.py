@@ -23,7 +23,7 @@ import pycolmap
 
 from wildgs.progress import Counter as Progressed
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.guided_matching import Matches, match_guided, neighbours
+from wildgs.sfm.guided_matching import GuidedMatches, Matches, match_guided, neighbours
 from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
 from wildgs.sfm.workplace import Workplace
 
@@ -50,6 +50,7 @@ def refine(
     count: int,
     config: SfmConfig,
     progress: Progressed,
+    guided: GuidedMatches,
     constant: Collection[int] = (),
 ) -> Any:
     """Matches the photos of a finished model again, triangulates its points anew and adjusts everything.
@@ -60,6 +61,7 @@ def refine(
         count: Number of all photos.
         config: Options.
         progress: Called with (pairs matched again, total number of pairs).
+        guided: Guided matches of earlier calls, which are not found again; receives those of this one.
         constant: Ids of cameras whose lenses stay as they are.
 
     Returns:
@@ -70,7 +72,7 @@ def refine(
     first = _adjusted(work, known, verified, count, config, constant)
     if first is None:
         return known
-    matches = with_guided_matches(work, first, verified, progress)
+    matches = with_guided_matches(work, first, verified, guided, progress)
     second = _adjusted(work, triangulate(first, matches, config), verified, count, config, constant)
     return triangulate(first if second is None else second, matches, config)
 
@@ -100,21 +102,28 @@ def verified_matches(work: Workplace, model: Any) -> Matches:
     return found
 
 
-def with_guided_matches(work: Workplace, model: Any, verified: Matches, progress: Progressed) -> Matches:
+def with_guided_matches(
+    work: Workplace, model: Any, verified: Matches, guided: GuidedMatches, progress: Progressed
+) -> Matches:
     """Verified matches, and guided ones of features that have none in the other photo."""
-    pairs = neighbours(model, NEIGHBOURS, LEAST_SHARED)
+    pairs = [pair for pair in neighbours(model, NEIGHBOURS, LEAST_SHARED) if pair not in guided]
     with closing(pycolmap.Database.open(work.database)) as database:
-        guided = match_guided(model, database, pairs, REACH, progress)
+        guided.update(match_guided(model, database, pairs, REACH, progress))
+    registered = set(model.reg_image_ids())
     found = dict(verified)
     for pair, indices in guided.items():
-        known = found.get(pair, np.zeros((0, 2), np.uint32))
-        new = ~(np.isin(indices[:, 0], known[:, 0]) | np.isin(indices[:, 1], known[:, 1]))
-        found[pair] = np.concatenate([known, indices[new]])
+        if registered.issuperset(pair):
+            known = found.get(pair, np.zeros((0, 2), np.uint32))
+            new = ~(np.isin(indices[:, 0], known[:, 0]) | np.isin(indices[:, 1], known[:, 1]))
+            found[pair] = np.concatenate([known, indices[new]])
     return found
 
 
 def triangulate(model: Any, matches: Matches, config: SfmConfig) -> Any:
-    """A copy of a model with new points from matches; cameras stay as they are."""
+    """A copy of a model with new points from matches; cameras stay as they are.
+
+    Features that match in no third photo become points only where a photo has few others.
+    """
     options = pipeline_options(config).get_triangulation()
     copy = pycolmap.Reconstruction(model)
     for point in list(copy.point3D_ids()):
@@ -132,6 +141,10 @@ def triangulate(model: Any, matches: Matches, config: SfmConfig) -> Any:
     triangulator = pycolmap.IncrementalTriangulator(graph, copy, observations)
     for photo in photos:
         triangulator.triangulate_image(options, photo)
+    options.ignore_two_view_tracks = False
+    for photo in photos:
+        if copy.image(photo).num_points3D < LEAST_CONFIRMED:
+            triangulator.triangulate_image(options, photo)
     triangulator.complete_all_tracks(options)
     triangulator.merge_all_tracks(options)
     observations.filter_all_points3D(MAX_ERROR, MIN_ANGLE)
