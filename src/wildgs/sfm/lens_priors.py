@@ -49,12 +49,13 @@ ITERATIONS = 30
 ROBUST_SCALE = 1.0
 """Error from which the robust loss grows more slowly than the squared one, pixels."""
 
-SMALL_RESIDUAL, MOST_COPIES = 0.4, 100
-"""Largest residual of a pseudo-observation of a focal length, pixels, which is divided among so many copies, and
-upper bound on their number. A robust loss would take a large one for a wrong match."""
+SMALL_RESIDUAL, MOST_COPIES, RING_COPIES = 0.4, 100, 4
+"""A robust loss would take a large residual of a pseudo-observation for a wrong match. With it, that of a focal length
+is divided among as many observations as make it smaller than the first number, in pixels, but not more than the
+second; the third is the number of observations of each point of the rings."""
 
-RING_COPIES = 4
-"""Number of observations of each point of the rings."""
+LEAST_COPIES = 2
+"""Number of observations of a point that COLMAP's bundle adjustment needs."""
 
 RING = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 INNER = 0.5
@@ -129,7 +130,7 @@ def _adjust(
         config.add_image(photo)
     for lens in constant:
         config.set_constant_cam_intrinsics(lens)
-    pseudo = _PseudoObservations(trial, config)
+    pseudo = _PseudoObservations(trial, config, robust=robust)
     for lens in lenses:
         camera = trial.camera(lens)
         if lens not in priors:
@@ -154,8 +155,8 @@ def _adjust(
 class _PseudoObservations:
     """Images that do not exist and their points, in a copy of a model."""
 
-    def __init__(self, trial: Any, config: Any) -> None:
-        self._trial, self._config = trial, config
+    def __init__(self, trial: Any, config: Any, *, robust: bool = False) -> None:
+        self._trial, self._config, self._robust = trial, config, robust
         self._points: list[int] = []
         self._frames: list[int] = []
 
@@ -164,8 +165,8 @@ class _PseudoObservations:
         focal = camera.mean_focal_length()
         deviation = math.log(focal / prior.focal) / prior.spread
         target = focal * (1 - deviation * prior.spread)
-        # COLMAP's bundle adjustment needs two observations of a point.
-        copies = min(max(2, math.ceil((RESIDUAL * deviation / SMALL_RESIDUAL) ** 2)), MOST_COPIES)
+        many = math.ceil((RESIDUAL * deviation / SMALL_RESIDUAL) ** 2) if self._robust else LEAST_COPIES
+        copies = min(max(LEAST_COPIES, many), MOST_COPIES)
         points = np.array([[RESIDUAL / (prior.spread * focal) / math.sqrt(copies), 0.0]])
         self._add(camera, points, points * target, copies=copies, constant=True)
 
@@ -176,11 +177,12 @@ class _PseudoObservations:
         # Information about the coefficient in N points of two rings of radius a and INNER a, after the distance
         # from their plane is eliminated: N f^2 a^6 times this number. It should be (RESIDUAL / its deviation)^2.
         left = 1 + INNER**6 - (1 + INNER**4) ** 2 / (1 + INNER**2)
-        number = RING_COPIES * len(RING)
+        copies = RING_COPIES if self._robust else LEAST_COPIES
+        number = copies * len(RING)
         outer = (RESIDUAL**2 / (corner_shift**2 * left * number * diagonal**2)) ** (1 / 6)
         radius = outer * diagonal / focal
         points = radius * np.concatenate([RING, INNER * RING])
-        self._add(camera, points, points * focal, copies=RING_COPIES, constant=False)
+        self._add(camera, points, points * focal, copies=copies, constant=False)
 
     def _add(
         self, camera: Any, points: np.ndarray, offsets: np.ndarray, *, copies: int, constant: bool
