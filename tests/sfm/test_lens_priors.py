@@ -190,7 +190,8 @@ def test_distortion_prior_has_its_width(robust: bool) -> None:
     assert squared_residuals(model) < 1e-3
 
 
-@pytest.mark.parametrize("robust", [False, True])nder_either_loss(robust: bool) -> None:
+@pytest.mark.parametrize("robust", [False, True])
+def test_priors_hold_lenses_under_either_loss(robust: bool) -> None:
     """A robust loss takes no prior for a wrong match, even if the lens is far from usual."""
     model = photographed(1.0, spread=0.3, deep=0.02, noise=0.3)
     for lens in model.cameras.values():

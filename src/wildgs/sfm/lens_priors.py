@@ -50,9 +50,9 @@ ROBUST_SCALE = 1.0
 """Error from which the robust loss grows more slowly than the squared one, pixels."""
 
 SMALL_RESIDUAL, MOST_COPIES, RING_COPIES = 0.4, 100, 4
-"""A robust loss would take a large residual of a pseudo-observation for a wrong match. With it, that of a focal length
-is divided among as many observations as make it smaller than the first number, in pixels, but not more than the
-second; the third is the number of observations of each point of the rings."""
+"""With a robust loss, which would take a large residual of a pseudo-observation for a wrong match: that of a focal
+length is divided among as many observations as make it smaller than the first number, in pixels, but not more than
+the second; the third is the number of observations of each point of the rings."""
 
 LEAST_COPIES = 2
 """Number of observations of a point that COLMAP's bundle adjustment needs."""
