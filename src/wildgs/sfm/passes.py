@@ -1,4 +1,7 @@
-"""The passes of structure from motion; the second and third register photos that the first one leaves out."""
+"""The passes of structure from motion; the second and third register photos that the first one leaves out.
+
+The model is refined after them (`wildgs.sfm.refinement`).
+"""
 
 from __future__ import annotations
 
