@@ -150,3 +150,15 @@ def test_a_model_without_points_has_no_neighbours(made: tuple[Any, EditedDatabas
     for point in list(model.point3D_ids()):
         model.delete_point3D(point)
     assert neighbours(model, 5, 1) == []
+
+
+def test_features_without_a_direction_have_no_matches(made: tuple[Any, EditedDatabase]) -> None:
+    """The corners of a photo beyond what its distortion can show."""
+    model, _ = made
+    pair = neighbours(model, 2, 10)[0]
+    lens = model.image(pair[1]).camera
+    lens.params = [300.0, *lens.params[1:3], -0.6]
+    places = np.array([feature.xy for feature in model.image(pair[1]).points2D])
+    lost = np.isnan(lens.cam_from_img(places)).any(axis=1)
+    assert lost.any()
+    assert not lost[matched(made, pair)[pair][:, 1]].any()

@@ -28,12 +28,13 @@ Matches = Mapping[ImagePair, UInt32[np.ndarray, "_ 2"]]
 """Indices of matched features by pair of images."""
 
 GuidedMatches = dict[ImagePair, UInt32[np.ndarray, "_ 2"]]
+"""The same, of pairs that have been matched along epipolar lines."""
 
 RATIO = 0.7
 """Lowe's ratio: largest angle between descriptors of a match relative to the second smallest."""
 
 LARGEST_ANGLE = 0.8
-"""Largest angle between descriptors of a match, radians; unrelated descriptors have about 1.2."""
+"""Largest angle between descriptors of a match, radians; unrelated ones have 0.80 to 0.87 in the median."""
 
 SAME_PLACE = 3.0
 """Distance up to which features are at one place, pixels: the same corner has several of different sizes."""
@@ -124,6 +125,7 @@ def match_guided(
 
 def _read(image: Any, database: Any, reach: float) -> _Features:
     camera = image.camera
+    # Rays that strong distortion leaves without a direction are NaN, and near no line.
     pixels = np.asarray(database.read_keypoints(image.image_id))[:, :2].astype(np.float64)
     descriptors = np.asarray(database.read_descriptors(image.image_id).data).astype(np.float32)
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)

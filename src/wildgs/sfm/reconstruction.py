@@ -48,9 +48,9 @@ def reconstruct(
     """Estimates the cameras of a folder of photos and writes a scene for `load_scene`.
 
     Every photo has its own camera, features are SIFT, mapping is incremental with two additional passes
-    (`wildgs.sfm.passes`), and the largest model is kept, refined (`wildgs.sfm.refinement`) and undistorted. CUDA is used if pycolmap was built with
-    it. SIGTERM and SIGHUP interrupt the work like Ctrl-C. Intermediate results are kept in a hidden folder beside
-    the output, so that the same call continues after an interruption.
+    (`wildgs.sfm.passes`), and the largest model is kept, refined (`wildgs.sfm.refinement`) and undistorted. CUDA is
+    used if pycolmap was built with it. SIGTERM and SIGHUP interrupt the work like Ctrl-C. Intermediate results are
+    kept in a hidden folder beside the output, so that the same call continues after an interruption.
 
     Args:
         photos: Folder of photos, searched with its sub-folders and not modified.
