@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from wildgs.sfm import refinement
+from wildgs.sfm import incremental, refinement
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lens_priors import USUAL_SHIFT, LensPrior, adjust_with_priors
 from wildgs.sfm.refinement import CONFIRMED, refine, triangulate, unconfirmed, verified_matches
@@ -189,3 +189,15 @@ def test_guided_matches_are_found_once(
     totals = []
     refine(work, model, len(model.images), SfmConfig(), lambda done, total: totals.append(total), guided)
     assert len(totals) < len(guided)
+
+
+def test_very_many_photos_are_adjusted_without_guided_matches(
+    made: tuple[Workplace, Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refinement, "GUIDED_LIMIT", 5)
+    monkeypatch.setattr(incremental, "PRIORS_LIMIT", 5)
+    work, truth, model = made
+    guided: dict[tuple[int, int], np.ndarray] = {}
+    after = refine(work, model, len(model.images), SfmConfig(), nothing, guided)
+    assert not guided
+    assert error(after, truth) < 0.7 * error(model, truth)

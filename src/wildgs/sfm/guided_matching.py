@@ -80,20 +80,17 @@ def neighbours(model: Any, most: int, least_shared: int) -> list[ImagePair]:
         return []
     points = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
     seen = csr_array(
-        (np.ones(len(points), np.int64), (np.searchsorted(photos, np.concatenate(rows)), points)),
+        (np.ones(len(points), np.int32), (np.searchsorted(photos, np.concatenate(rows)), points)),
         shape=(len(photos), len(rows)),
     )
-    shared = (seen @ seen.T).toarray()
-    np.fill_diagonal(shared, 0)
-    nearest = np.argsort(-shared, axis=1, kind="stable")[:, :most]
-    return sorted(
-        {
-            (int(photos[min(row, other)]), int(photos[max(row, other)]))
-            for row, others in enumerate(nearest)
-            for other in others
-            if shared[row, other] >= least_shared
-        }
-    )
+    shared = csr_array(seen @ seen.T)
+    pairs = set()
+    for row, start, end in zip(range(len(photos)), shared.indptr, shared.indptr[1:], strict=False):
+        others, counts = shared.indices[start:end], np.asarray(shared.data[start:end])
+        order = np.lexsort((others, np.negative(counts)))
+        kept = order[(others[order] != row) & (counts[order] >= least_shared)][:most]
+        pairs |= {(int(photos[min(row, other)]), int(photos[max(row, other)])) for other in others[kept]}
+    return sorted(pairs)
 
 
 def match_guided(

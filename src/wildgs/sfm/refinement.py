@@ -33,6 +33,10 @@ REACH = 0.003
 NEIGHBOURS, LEAST_SHARED = 5, 3
 """Photos with which each one is matched again, those that share most points, and the smallest number of these."""
 
+GUIDED_LIMIT = 1000
+"""Number of photos up to which they are matched again, for a quarter of an hour on one core. More photos have more
+matches of each point."""
+
 CONFIRMED = 3
 """Number of photos from which a point moves cameras."""
 
@@ -69,23 +73,29 @@ def refine(
     """
     verified = verified_matches(work, model)
     known = triangulate(model, verified, config)
-    first = _adjusted(work, known, verified, count, config, constant)
+    first = _adjusted(work, known, known, verified, count, config, constant)
     if first is None:
         return known
     matches = with_guided_matches(work, first, verified, guided, progress)
-    second = _adjusted(work, triangulate(first, matches, config), verified, count, config, constant)
+    second = _adjusted(work, triangulate(first, matches, config), first, verified, count, config, constant)
     return triangulate(first if second is None else second, matches, config)
 
 
 def _adjusted(
-    work: Workplace, model: Any, verified: Matches, count: int, config: SfmConfig, constant: Collection[int]
+    work: Workplace,
+    model: Any,
+    before: Any,
+    verified: Matches,
+    count: int,
+    config: SfmConfig,
+    constant: Collection[int],
 ) -> Any | None:
-    """The model with adjusted cameras and points from verified matches; None if these are much fewer."""
+    """The model with adjusted cameras and points from verified matches; None if these are far fewer."""
     adjusted = pycolmap.Reconstruction(model)
     for point in unconfirmed(adjusted):
         adjusted.delete_point3D(point)
     adjust_robustly(work, adjusted, count, constant)
-    before, after = (triangulate(each, verified, config) for each in (model, adjusted))
+    after = triangulate(adjusted, verified, config)
     kept = after.compute_num_observations() >= LEAST_KEPT * before.compute_num_observations()
     return after if kept else None
 
@@ -106,7 +116,9 @@ def with_guided_matches(
     work: Workplace, model: Any, verified: Matches, guided: GuidedMatches, progress: Progressed
 ) -> Matches:
     """Verified matches, and guided ones of features that have none in the other photo."""
-    pairs = [pair for pair in neighbours(model, NEIGHBOURS, LEAST_SHARED) if pair not in guided]
+    few = model.num_reg_images() <= GUIDED_LIMIT
+    nearest = neighbours(model, NEIGHBOURS, LEAST_SHARED) if few else []
+    pairs = [pair for pair in nearest if pair not in guided]
     with closing(pycolmap.Database.open(work.database)) as database:
         guided.update(match_guided(model, database, pairs, REACH, progress))
     registered = set(model.reg_image_ids())
