@@ -20,6 +20,7 @@ from jaxtyping import Float32, Float64, Int64, UInt32
 from scipy.sparse import csr_array
 
 from wildgs.progress import Counter as Progressed
+from wildgs.sfm.lookalikes import essential_matrix, unproject
 
 ImagePair = tuple[int, int]
 """Ids of two images, the smaller one first."""
@@ -53,7 +54,7 @@ class _Features:
     Attributes:
         descriptors: Unit vectors.
         pixels: Positions.
-        rays: Directions in the camera's frame with z = 1.
+        rays: Directions in the camera's frame with z = 1; NaN, which is near no line, where there is none.
         reach: Tangent of the angle within which features are near an epipolar line.
     """
 
@@ -115,28 +116,21 @@ def match_guided(
 
     found: GuidedMatches = {}
     for done, pair in enumerate(pairs, start=1):
-        found[pair] = _match(features(pair[0]), features(pair[1]), _essential(model, pair))
+        essential = essential_matrix(*(model.image(photo) for photo in pair))
+        found[pair] = _match(features(pair[0]), features(pair[1]), essential)
         progress(done, len(pairs))
     return found
 
 
 def _read(image: Any, database: Any, reach: float) -> _Features:
     camera = image.camera
-    # Rays that strong distortion leaves without a direction are NaN, and near no line.
     pixels = np.asarray(database.read_keypoints(image.image_id))[:, :2].astype(np.float64)
     descriptors = np.asarray(database.read_descriptors(image.image_id).data).astype(np.float32)
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
-    rays = np.concatenate([camera.cam_from_img(pixels), np.ones((len(pixels), 1))], axis=1)
     side = max(camera.width, camera.height)
-    return _Features(descriptors, pixels, rays, reach * side / camera.mean_focal_length())
-
-
-def _essential(model: Any, pair: ImagePair) -> Float64[np.ndarray, "3 3"]:
-    """The essential matrix that maps rays of the first photo to epipolar lines in the second."""
-    first, second = (model.image(photo).cam_from_world() for photo in pair)
-    motion = second * first.inverse()
-    x, y, z = motion.translation
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion.rotation.matrix()
+    return _Features(
+        descriptors, pixels, unproject(camera, pixels), reach * side / camera.mean_focal_length()
+    )
 
 
 def _match(

@@ -67,15 +67,30 @@ def count_agreeing(model: Any, database_file: Path) -> tuple[int, int]:
     return sum(int(mask.sum()) for mask in agreeing), sum(len(mask) for mask in agreeing)
 
 
-def _verified(model: Any, database_file: Path) -> Iterator[tuple[Any, Any, Shaped[np.ndarray, "M 2"]]]:
-    """Pairs of registered photos with enough verified matches, and these."""
+def verified_matches(
+    model: Any, database_file: Path, least: int = 1
+) -> Iterator[tuple[tuple[int, int], Shaped[np.ndarray, "_ 2"]]]:
+    """Pairs of photos of a model that have enough verified matches, and these.
+
+    Args:
+        model: pycolmap's reconstruction.
+        database_file: Database with the verified matches.
+        least: Smallest number of matches of a pair.
+
+    Yields:
+        The ids of two images, the smaller one first, and indices of their features.
+    """
     registered = set(model.reg_image_ids())
     with closing(pycolmap.Database.open(database_file)) as database:
         for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            if inliers >= LEAST_MATCHES and first in registered and second in registered:
-                matches = database.read_two_view_geometry(first, second).inlier_matches
-                yield model.image(first), model.image(second), matches
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            if inliers >= least and registered.issuperset(pair):
+                yield pair, database.read_two_view_geometry(*pair).inlier_matches
+
+
+def _verified(model: Any, database_file: Path) -> Iterator[tuple[Any, Any, Shaped[np.ndarray, "M 2"]]]:
+    for (first, second), matches in verified_matches(model, database_file, LEAST_MATCHES):
+        yield model.image(first), model.image(second), matches
 
 
 def _judge(
@@ -105,9 +120,8 @@ def agreeing_matches(
         max_error: Largest distance from the epipolar line, relative to the longer side.
     """
     places = [_keypoints(image)[matches[:, side]] for side, image in enumerate((first, second))]
-    rays = [_unproject(image.camera, points) for image, points in zip((first, second), places, strict=True)]
-    relative = second.cam_from_world() * first.cam_from_world().inverse()
-    essential = pycolmap.essential_matrix_from_pose(relative)
+    rays = [unproject(image.camera, points) for image, points in zip((first, second), places, strict=True)]
+    essential = essential_matrix(first, second)
     lines = rays[0] @ essential.T, rays[1] @ essential
     residual = np.abs((rays[1] * lines[0]).sum(axis=1))
     fits = np.ones(len(matches), dtype=bool)
@@ -122,6 +136,13 @@ def _keypoints(image: Any) -> Float64[np.ndarray, "N 2"]:
     return np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
 
 
-def _unproject(camera: Any, points: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
+def essential_matrix(first: Any, second: Any) -> Float64[np.ndarray, "3 3"]:
+    """The matrix that maps rays of an image to epipolar lines of another one."""
+    relative = second.cam_from_world() * first.cam_from_world().inverse()
+    return pycolmap.essential_matrix_from_pose(relative)
+
+
+def unproject(camera: Any, points: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
+    """Directions of pixels in the camera's frame with z = 1; NaN where strong distortion leaves none."""
     rays = camera.cam_from_img(points)
     return np.concatenate([rays, np.ones((len(points), 1))], axis=1)

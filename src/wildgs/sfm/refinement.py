@@ -25,6 +25,7 @@ from wildgs.progress import Counter as Progressed
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.guided_matching import GuidedMatches, Matches, match_guided, neighbours
 from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
+from wildgs.sfm.lookalikes import verified_matches
 from wildgs.sfm.workplace import Workplace
 
 REACH = 0.003
@@ -71,7 +72,7 @@ def refine(
     Returns:
         A model with the same photos.
     """
-    verified = verified_matches(work, model)
+    verified = dict(verified_matches(model, work.database))
     known = triangulate(model, verified, config)
     first = _adjusted(work, known, known, verified, count, config, constant)
     if first is None:
@@ -98,18 +99,6 @@ def _adjusted(
     after = triangulate(adjusted, verified, config)
     kept = after.compute_num_observations() >= LEAST_KEPT * before.compute_num_observations()
     return after if kept else None
-
-
-def verified_matches(work: Workplace, model: Any) -> Matches:
-    """The verified matches between photos of a model."""
-    registered = set(model.reg_image_ids())
-    found = {}
-    with closing(pycolmap.Database.open(work.database)) as database:
-        for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
-            pair = pycolmap.pair_id_to_image_pair(pair_id)
-            if inliers and registered.issuperset(pair):
-                found[pair] = database.read_two_view_geometry(*pair).inlier_matches
-    return found
 
 
 def with_guided_matches(
