@@ -24,7 +24,7 @@ import tyro
 
 import wildgs
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.sfm import passes, reconstruction
+from wildgs.sfm import reconstruction, registration
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lookalikes import count_agreeing
 from wildgs.sfm.upright import WorkingCopy, list_photos
@@ -51,9 +51,9 @@ class Kept:
     """Writes the scene before and after the first call of `refine` during `wildgs.reconstruct`."""
 
     def __init__(self, output: Path) -> None:
-        self._output, self._refine, self._find = output, passes.refine, reconstruction.find_poses
+        self._output, self._refine, self._find = output, registration.refine, reconstruction.find_poses
         self._copies: list[WorkingCopy] = []
-        passes.refine, reconstruction.find_poses = self._keep, self._note
+        registration.refine, reconstruction.find_poses = self._keep, self._note
 
     def _note(self, work: Workplace, copies: list[WorkingCopy], *rest: Any) -> Any:
         self._copies = copies

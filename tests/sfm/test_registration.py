@@ -7,10 +7,14 @@ from wildgs.progress import silent
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
-from wildgs.sfm.passes import drop_unsure, map_rest, place_with_plain_lens
-from wildgs.sfm.placement import NEIGHBOUR_POINTS, PassName, count_neighbours
+from wildgs.sfm.placement import NEIGHBOUR_POINTS, count_neighbours
+from wildgs.sfm.registration import Registration, drop_unsure
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
+
+
+def registration(work: Workplace, copies: list[WorkingCopy]) -> Registration:
+    return Registration(work, copies, describe_photos(work, copies, 0), SfmConfig(), silent)
 
 
 def test_a_photo_with_an_implausible_lens_is_placed_with_a_plain_one(
@@ -20,11 +24,10 @@ def test_a_photo_with_an_implausible_lens_is_placed_with_a_plain_one(
     name, config = copies[LOST].work_name, SfmConfig()
     rest = [copy.work_name for copy in copies[:LOST]]
     model = map_photos(work, len(copies), config, silent, only=rest)[0]
-    vlads = describe_photos(work, copies, 0)
-    passes: dict[str, PassName] = {}
-    placed = place_with_plain_lens(work, copies, vlads, model, {name}, {}, passes, config, silent)
+    photos = registration(work, copies)
+    placed = photos.place_with_plain_lens(model, {name})
     assert missing_from(placed, copies) == []
-    assert passes == {name: "second"}
+    assert photos.passes == {name: "second"}
     lens = find_registered(placed, copies[LOST]).camera
     assert lens.params[3] == 0
     with pycolmap.Database.open(work.database) as database:
@@ -36,8 +39,7 @@ def test_other_photos_are_not_tried(matched: tuple[Workplace, list[WorkingCopy]]
     work, copies = matched
     rest = [copy.work_name for copy in copies[:LOST]]
     model = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
-    vlads = describe_photos(work, copies, 0)
-    assert place_with_plain_lens(work, copies, vlads, model, {"no.jpg"}, {}, {}, SfmConfig(), silent) is model
+    assert registration(work, copies).place_with_plain_lens(model, {"no.jpg"}) is model
 
 
 def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:
@@ -68,18 +70,16 @@ def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[
         if main.image(image_id).name not in kept:
             main.deregister_frame(main.image(image_id).frame_id)
     assert main.num_reg_images() == 2
-    vlads = describe_photos(work, copies, 0)
-    passes: dict[str, PassName] = {}
-    models = map_rest(work, copies, vlads, main, passes, SfmConfig(), silent)
+    photos = registration(work, copies)
+    models = photos.map_rest(main)
     assert models[0].num_reg_images() > main.num_reg_images()
     assert {2, 3, 4}.isdisjoint(missing_from(models[0], copies))
     joined = {name for name in kept if models[0].find_image_with_name(name) is not None}
-    assert joined <= set(passes), "in this model, they were registered by a later pass"
+    assert joined <= set(photos.passes), "in this model, they were registered by a later pass"
 
 
 def test_fewer_than_three_photos_are_no_model(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
     work, copies = matched
     rest = [copy.work_name for copy in copies[:LOST]]
     main = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
-    vlads = describe_photos(work, copies, 0)
-    assert map_rest(work, copies, vlads, main, {}, SfmConfig(), silent) == []
+    assert registration(work, copies).map_rest(main) == []

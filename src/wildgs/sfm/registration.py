@@ -1,0 +1,213 @@
+"""Registration of photos that the first pass of structure from motion leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence, Set
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pycolmap
+from jaxtyping import Float
+from torch import Tensor
+
+from wildgs.progress import Progress, counter
+from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.guided_matching import GuidedMatches
+from wildgs.sfm.incremental import LEAST_GROUP, by_size
+from wildgs.sfm.lookalikes import find_doubtful
+from wildgs.sfm.mapping import (
+    continue_mapping,
+    lenses_of,
+    map_photos,
+    map_repeatedly,
+    missing_from,
+)
+from wildgs.sfm.matching import forget_pairs, match_pairs, verified_pairs
+from wildgs.sfm.pairs import Pair, alike_pairs, friends_of_friends
+from wildgs.sfm.placement import PassName, count_neighbours, find_groups
+from wildgs.sfm.point_matching import match_to_points
+from wildgs.sfm.refinement import refine
+from wildgs.sfm.upright import WorkingCopy
+from wildgs.sfm.workplace import Workplace
+
+ENOUGH_MATCHES = 60
+"""Number of matches from which a pair is not matched again."""
+
+POINT_ROUNDS = 5
+"""Upper bound on rounds of matching to points; newly registered photos add points for others."""
+
+LEAST_POINTS = 10
+"""Smallest number of sparse points of a photo registered by a later pass."""
+
+
+@dataclass
+class Registration:
+    """Photos of a collection whose features are matched, and what the later passes found.
+
+    Models are never modified, except by `drop_unsure`.
+
+    Attributes:
+        work: The workplace, whose database contains features and matches.
+        copies: All photos.
+        vlads: Their VLAD descriptors.
+        config: Options.
+        progress: Called during matching and mapping.
+        crops: Photos that are crops of others; these are not matched again.
+        passes: The pass that registered a photo, if not the first, by name of its working copy.
+        guided: Guided matches, kept from one refinement to the next.
+    """
+
+    work: Workplace
+    copies: Sequence[WorkingCopy]
+    vlads: Float[Tensor, "N D"]
+    config: SfmConfig
+    progress: Progress
+    crops: Set[int] = frozenset()
+    passes: dict[str, PassName] = field(default_factory=dict)
+    guided: GuidedMatches = field(default_factory=dict)
+
+    def try_again(self, models: list[Any]) -> tuple[list[Any], set[Pair]]:
+        """Runs the second and third pass.
+
+        Returns:
+            All models, and the pairs that were matched again.
+        """
+        if models:
+            models = [self._place_by_points(models[0], "second"), *models[1:]]
+            if not self.missing(models[0]):
+                return models[:1], set()
+        more = self._more_pairs(models)
+        if not self.work.is_done("more matches"):
+            forget_pairs(self.work, self.copies, more)
+            show = counter(self.progress, "matching again")
+            match_pairs(self.work, self.copies, more, self.config, show, tolerant=True)
+            self.work.set_done("more matches")
+        if not models:
+            return map_photos(self.work, len(self.copies), self.config, self.progress), more
+        main = self._third_pass(models[0])
+        apart = replace(self, passes={})
+        models = by_size([main, *apart.map_rest(main)])
+        if models[0] is not main:
+            self.passes = apart.passes
+        return models, more
+
+    def refine(self, model: Any) -> Any:
+        """The refined model, with photos that only its points, of which there are more, give a pose."""
+        refined = self._refined(model)
+        if not self.config.second_chance or not self.missing(refined):
+            return refined
+        grown = self._place_by_points(refined, "second")
+        drop_unsure(grown, self.work, self.passes)
+        return self._refined(grown) if names_of(grown) - names_of(refined) else refined
+
+    def place_with_plain_lens(self, model: Any, names: Collection[str]) -> Any:
+        """Registers photos whose lens had become implausible with the focal length of their matches to points.
+
+        Their lenses have no distortion and stay as they are, because bundle adjustment made them implausible.
+
+        Args:
+            model: The model, without these photos.
+            names: Names of their working copies.
+
+        Returns:
+            The model, with those of the photos for which a pose was found.
+        """
+        show = counter(self.progress, "matching to points")
+        if not match_to_points(self.work, self.copies, self.vlads, model, self.config.seed, show, only=names):
+            return model
+        after = self._continue(model, "second", names)
+        drop_unsure(after, self.work, self.passes)
+        return self._refined(after, lenses_of(self.work, names))
+
+    def map_rest(self, main: Any) -> list[Any]:
+        """Models of the photos that the main model leaves out.
+
+        If more of them belong together than the main model has, that is a model of another place which happened to
+        be found first. They are mapped alone, with several seeds, and with a second and third pass of their own.
+        """
+        rest = self.missing(main)
+        if len(rest) < LEAST_GROUP:
+            return []
+        with closing(pycolmap.Database.open(self.work.database)) as database:
+            groups = find_groups(rest, verified_pairs(database, self.copies))
+        largest = max(groups.values(), key=len)
+        if len(largest) > main.num_reg_images():
+            only = [self.copies[row] for row in sorted(largest)]
+            models = map_repeatedly(self.work, self.copies, self.config, self.progress, only)
+            if models:
+                models[0] = self._third_pass(self._place_by_points(models[0], "second"))
+            return models
+        names = [self.copies[row].work_name for row in rest]
+        return map_photos(self.work, len(self.copies), self.config, self.progress, names)
+
+    def missing(self, model: Any) -> list[int]:
+        """The photos without a pose in a model."""
+        return missing_from(model, self.copies)
+
+    def _third_pass(self, model: Any) -> Any:
+        """Registers photos with fewer inliers, matches others to the points again, and drops unsure ones."""
+        main = self._place_by_points(self._continue(model, "third"), "third")
+        drop_unsure(main, self.work, self.passes)
+        return main
+
+    def _place_by_points(self, model: Any, name: PassName) -> Any:
+        """Registers further photos by matching them to the model's points, repeatedly."""
+        show = counter(self.progress, "matching to points")
+        for _ in range(POINT_ROUNDS):
+            if not match_to_points(self.work, self.copies, self.vlads, model, self.config.seed, show):
+                break
+            before, model = model, self._continue(model, name)
+            if model.num_reg_images() == before.num_reg_images():
+                break
+        return model
+
+    def _continue(self, model: Any, name: PassName, constant_lenses: Collection[str] = ()) -> Any:
+        """Registers further photos by the matches in the database, and notes the pass."""
+        count = len(self.copies)
+        after = continue_mapping(
+            self.work, model, count, self.config, self.progress, constant_lenses=constant_lenses
+        )
+        for new in names_of(after) - names_of(model):
+            self.passes.setdefault(new, name)
+        return after
+
+    def _refined(self, model: Any, constant: Collection[int] = ()) -> Any:
+        show = counter(self.progress, "matching along epipolar lines")
+        return refine(self.work, model, len(self.copies), self.config, show, self.guided, constant)
+
+    def _more_pairs(self, models: Sequence[Any]) -> set[Pair]:
+        """Further pairs for photos without a pose, by retrieval and shared matches, of those that match poorly."""
+        kept = [photo for photo in range(len(self.copies)) if photo not in self.crops]
+        missing = set(self.missing(models[0]) if models else kept)
+        with closing(pycolmap.Database.open(self.work.database)) as database:
+            matched = verified_pairs(database, self.copies)
+        count = self.config.pairing.neighbours
+        wanted = {row: count for row, photo in enumerate(kept) if photo in missing}
+        alike = {(kept[a], kept[b]) for a, b in alike_pairs(self.vlads[kept], wanted)}
+        friends = friends_of_friends(missing - self.crops, matched, count)
+        return {
+            pair
+            for pair in alike | friends
+            if not set(pair) & self.crops and matched.get(pair, 0) < ENOUGH_MATCHES
+        }
+
+
+def names_of(model: Any) -> set[str]:
+    """Names of the registered working copies."""
+    return {model.image(image_id).name for image_id in model.reg_image_ids()}
+
+
+def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> None:
+    """Removes photos registered by a later pass whose poses are not reliable.
+
+    They have too few points, are contradicted by most of their matches, or share few points with every other photo.
+    Repeated architecture, like the sides of an octagonal tower, gives points scattered over many photos.
+    """
+    doubtful = find_doubtful(model, work.database, {name: name for name in names_of(model)})
+    for image_id in list(model.reg_image_ids()):
+        image = model.image(image_id)
+        if image.name not in passes:
+            continue
+        if image.name in doubtful or image.num_points3D < LEAST_POINTS or not count_neighbours(model, image):
+            model.deregister_frame(image.frame_id)
