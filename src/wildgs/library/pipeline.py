@@ -198,7 +198,7 @@ def estimate_depth(
     if not scene.is_dir():
         raise UserError(f"{scene}: no such folder; give the folder of a COLMAP scene")
     if by == "stereo":
-        show = counter(progress, "comparing photos")
+        show = counter(progress, "multi-view stereo")
         written, kept = fill_metric_folder(
             scene, stereo or StereoConfig(), holdout=holdout, overwrite=overwrite, progress=show
         )

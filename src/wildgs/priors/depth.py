@@ -101,13 +101,11 @@ def load_depth_anything(
     source = source or DEPTH_ANYTHING
     model = _find_model(source)
     if model is None:
-        message = (
-            f"Depth Anything ({source}) is neither a folder nor cached, and the hub is not reachable; only"
-            f" depth maps already in depth/ are used. Download it with `hf download {source}`, give its folder,"
-            " or use `wildgs depth --by stereo`"
-        )
+        message = f"Depth Anything ({source}) is neither a folder nor cached, and the hub is not reachable"
+        download = f"Download it with `hf download {source}`"
         if required:
-            raise UserError(message)
+            raise UserError(f"{message}. {download}, give its folder, or use `wildgs depth --by stereo`")
+        message += f"; only depth maps already in depth/ are used, such as those of stereo. {download}"
         warnings.warn(message, WildGSWarning, stacklevel=2)
         return None
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
