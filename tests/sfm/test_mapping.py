@@ -20,6 +20,9 @@ class FakeModel:
     def compute_num_observations(self) -> int:
         return self.observations
 
+    def num_reg_images(self) -> int:
+        return len(self.names)
+
     def find_image_with_name(self, name: str) -> SimpleNamespace | None:
         return SimpleNamespace(has_pose=True) if name in self.names else None
 
@@ -49,15 +52,25 @@ def test_mapping_is_repeated_while_photos_are_missing(
     seeds = []
 
     def run(
-        work: Workplace, count: int, config: SfmConfig, progress: object, only: Sequence[str], *, wide: bool
+        work: Workplace,
+        count: int,
+        config: SfmConfig,
+        progress: object,
+        only: Sequence[str],
+        *,
+        wide: bool,
+        pair: tuple[int, int] | None,
     ) -> list[FakeModel]:
         assert list(only) == []
         assert wide == (len(seeds) % 3 == 1)
+        assert pair == ((1, 2) if len(seeds) == 3 else None), "of few photos, initial pairs follow seeds"
         names = runs[len(seeds)]
         seeds.append(config.seed)
         return [FakeModel(names, 100 * len(names))] if names else []
 
     monkeypatch.setattr(mapping, "map_photos", run)
+    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter([(1, 2)]))
+    monkeypatch.setattr(mapping, "PAIR_ATTEMPTS", 0)
     monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (int(1000 * agreeing), 1000))
     monkeypatch.setattr(mapping, "is_wide", lambda model: True)
     monkeypatch.setattr(mapping, "FEW", 3 if few else 2)
@@ -79,6 +92,37 @@ def test_matches_that_agree_outweigh_points(
     models, counts = iter([FakeModel(["a"], 900), FakeModel(["a"], 800)]), iter(agreeing)
     monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 2)
     monkeypatch.setattr(mapping, "map_photos", lambda *_, **__: [next(models)])
+    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(()))
     monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (next(counts), 1000))
     found = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
     assert found[0].observations == (900, 800)[best]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "photos", "tried"),
+    [
+        ([2, 12, 11, 13, 14], 13, 4),  # the best of three models that grew, of which the last is not tried
+        ([2, 3, 0, 12, 2], 12, 5),
+        ([9, 12, 12, 12], 12, 4),
+        ([10, 12], 10, 1),  # not stuck
+    ],
+)
+def test_other_initial_pairs_are_tried_where_a_model_does_not_grow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sizes: list[int], photos: int, tried: int
+) -> None:
+    copies = [WorkingCopy(f"{row}.jpg", f"{row}", f"{row}.jpg", False) for row in range(40)]
+    pairs = [(row, row + 1) for row in range(len(sizes) - 1)]
+    asked: list[tuple[int, int] | None] = []
+
+    def run(*_: object, pair: tuple[int, int] | None, wide: bool = False) -> list[FakeModel]:
+        asked.append(pair)
+        size = sizes[0] if pair is None else sizes[1 + pair[0]]
+        return [FakeModel([f"{row}" for row in range(size)], size)] if size else []
+
+    monkeypatch.setattr(mapping, "map_photos", run)
+    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(pairs))
+    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (0, 1))
+    monkeypatch.setattr(mapping, "is_wide", lambda model: True)
+    models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    assert models[0].num_reg_images() == photos
+    assert asked == [None] * mapping.FIRST_ATTEMPTS + pairs[: tried - 1]

@@ -43,6 +43,16 @@ def test_a_photo_finds_its_pose_by_points(matched: tuple[Workplace, list[Working
     assert missing_from(continue_mapping(work, model, len(copies), config, silent), copies) == []
 
 
+def test_a_model_without_points_places_no_photo(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
+    work, copies = matched
+    names = [copy.work_name for copy in copies[:LOST]]
+    model = map_photos(work, len(copies), SfmConfig(), silent, only=names)[0]
+    for point in list(model.point3D_ids()):
+        model.delete_point3D(point)
+    vlads = describe_photos(work, copies, 0)
+    assert match_to_points(work, copies, vlads, model, 0, lambda done, total: None) == []
+
+
 def test_photos_left_out_are_drawn_beside_their_partner(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
     work, copies = matched
     model = map_photos(

@@ -117,9 +117,9 @@ def run(
         )
         loaded = LoadedScene(load_run(output), trained.appearances)
         scores = evaluate(loaded, scene=scene, progress=progress) if scene.test_views else {}
-        title = photos.resolve().name
+        title = output.resolve().name
         report, page = output / "report.html", output / "scene.html"
-        summary = f"{len(scene.views)} photos from {title}, {trained.steps} steps of Wild-GS."
+        summary = f"{len(scene.views)} photos from {photos.resolve().name}, {trained.steps} steps of Wild-GS."
         write_showcase(report, title, summary, scene, [("Wild-GS", loaded, scores)])
         write_scene_page(loaded, page, title, progress)
     return FinishedRun(output, {str(output): scores} if scores else {}, report, page)

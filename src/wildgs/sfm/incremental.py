@@ -88,7 +88,7 @@ def run_pipeline(
         wide: Whether photos may be distorted like those of action cameras and fisheye lenses.
 
     Returns:
-        The models, largest first.
+        The models that have points, largest first.
     """
     manager = pycolmap.ReconstructionManager()
     if start is not None:
@@ -119,7 +119,7 @@ def run_pipeline(
     if priors:
         for model in models:
             _finish(model, priors, _corner_shift(model, wide), constant)
-    return by_size(models)
+    return by_size([model for model in models if model.num_points3D()])
 
 
 def measure_distortion(work: Workplace, model: Any, count: int) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import pycolmap
@@ -12,6 +13,7 @@ import pycolmap
 from wildgs.progress import Progress
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.incremental import is_wide, pipeline_options, run_pipeline
+from wildgs.sfm.initial_pairs import LEAST_ANGLE, LEAST_MATCHES, initial_pairs
 from wildgs.sfm.lookalikes import count_agreeing
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -27,6 +29,13 @@ runs that register all of few photos differ, and some have wrong depths."""
 ENOUGH_AGREE = 0.75
 """Share of the verified matches that is enough. Right models of 16 to 24 photos of `longchamp` have 0.65 to 0.68,
 wrong ones 0.55 to 0.6."""
+
+STUCK_PHOTOS, STUCK_SHARE = 10, 1 / 3
+"""A first pass with fewer photos than this, and than this share of all, was stuck with its initial pair. Others are
+tried, with as few inliers as in later passes."""
+
+PAIR_ATTEMPTS, GROWN_MODELS = 12, 3
+"""Upper bounds on initial pairs tried then, and on models with more photos among which the best is chosen."""
 
 MATCH_WEIGHT = 6
 """Weight of a match that agrees with the poses, relative to an observation of a point."""
@@ -57,7 +66,7 @@ def map_repeatedly(
     progress: Progress,
     only: Sequence[WorkingCopy] = (),
 ) -> list[Any]:
-    """Repeats incremental mapping with other seeds while photos are missing; returns the models of the best run.
+    """Repeats incremental mapping with other seeds and initial pairs; returns the models of the best run.
 
     The best run is the one whose largest model has the highest score. Some runs expect strong distortion,
     and count only if they find it.
@@ -69,23 +78,58 @@ def map_repeatedly(
         progress: Called for every photo.
         only: The photos to map; empty for all.
     """
-    best: list[Any] = []
-    most, share = -1, 0.0
     names = [copy.work_name for copy in only]
-    few = len(only or copies) <= FEW
-    attempts = FEW_ATTEMPTS if few else FIRST_ATTEMPTS if len(copies) <= ATTEMPTS_LIMIT else 1
-    for attempt in range(attempts):
+    photos = only or copies
+    few, many = len(photos) <= FEW, len(copies) > ATTEMPTS_LIMIT
+    pairs = initial_pairs(work.database, names, config.seed)
+    best = _Best(work)
+    for attempt in range(FEW_ATTEMPTS if few else 1 if many else FIRST_ATTEMPTS):
         seeded = replace(config, seed=config.seed + attempt)
         wide = attempt % WIDE_EVERY == 1
-        models = map_photos(work, len(copies), seeded, progress, only=names, wide=wide)
-        usable = bool(models) and (not wide or is_wide(models[0]))
-        score, agreeing = _judge(models[0], work) if usable else (-1, 0.0)
-        if score > most:
-            best, most, share = models, score, agreeing
-        complete = bool(best) and not missing_from(best[0], only or copies)
-        if attempt and complete and (not few or share >= ENOUGH_AGREE):
-            break
-    return best
+        pair = None if attempt < FIRST_ATTEMPTS or wide else next(pairs, None)
+        best.offer(map_photos(work, len(copies), seeded, progress, names, wide=wide, pair=pair), wide=wide)
+        complete = bool(best.models) and not missing_from(best.models[0], photos)
+        if attempt and complete and (not few or best.share >= ENOUGH_AGREE):
+            return best.models
+    if _is_stuck(best.models, len(photos)):
+        grown = 0
+        for pair in islice(pairs, PAIR_ATTEMPTS):
+            models = map_photos(work, len(copies), config, progress, names, pair=pair)
+            best.offer(models)
+            grown += not _is_stuck(models, len(photos))
+            if grown == (1 if many else GROWN_MODELS):
+                break
+    return best.models
+
+
+@dataclass
+class _Best:
+    """The best run so far.
+
+    Attributes:
+        work: The workplace.
+        models: Its models, largest first.
+        score: The score of the largest one.
+        share: Share of the verified matches that agree closely with its poses.
+    """
+
+    work: Workplace
+    models: list[Any] = field(default_factory=list)
+    score: int = -1
+    share: float = 0.0
+
+    def offer(self, models: list[Any], *, wide: bool = False) -> None:
+        """Takes the models of a run if they are better."""
+        if not models or (wide and not is_wide(models[0])):
+            return
+        score, share = _judge(models[0], self.work)
+        if score > self.score:
+            self.models, self.score, self.share = models, score, share
+
+
+def _is_stuck(models: Sequence[Any], count: int) -> bool:
+    most = models[0].num_reg_images() if models else 0
+    return most < min(STUCK_PHOTOS, STUCK_SHARE * count)
 
 
 def _judge(model: Any, work: Workplace) -> tuple[int, float]:
@@ -106,6 +150,7 @@ def map_photos(
     only: Sequence[str] = (),
     *,
     wide: bool = False,
+    pair: tuple[int, int] | None = None,
 ) -> list[Any]:
     """Runs incremental mapping on some working copies or on all; returns all models, largest first.
 
@@ -116,9 +161,17 @@ def map_photos(
         progress: Called for every photo.
         only: Names of the working copies to map; empty for all.
         wide: Whether photos may be distorted like those of action cameras and fisheye lenses.
+        pair: Ids of the images to start with. Photos are added with as few inliers as in later passes then, and
+            there is one model at most. Default: COLMAP chooses.
     """
     options = pipeline_options(config)
     options.image_names = list(only)
+    if pair is not None:
+        options.init_image_id1, options.init_image_id2 = pair
+        options.mapper.init_min_num_inliers = LEAST_MATCHES
+        options.mapper.init_min_tri_angle = LEAST_ANGLE
+        options.multiple_models = False  # each of them would start with this pair
+        _expect_few_inliers(options)
     next_photo = _counted(progress, 2, count)  # a model starts with a pair
     return run_pipeline(work, options, count, next_photo, wide=wide)
 
@@ -148,14 +201,18 @@ def continue_mapping(
     start = work.fresh("start")
     model.write(start)
     options = pipeline_options(config)
-    options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
-    options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
+    _expect_few_inliers(options)
     constant = lenses_of(work, constant_lenses)
     options.constant_cameras = options.mapper.constant_cameras = constant
     options.multiple_models = False
     next_photo = _counted(progress, model.num_reg_images(), count)
     models = run_pipeline(work, options, count, next_photo, start, constant, wide=is_wide(model))
     return models[0] if models and models[0].num_reg_images() >= model.num_reg_images() else model
+
+
+def _expect_few_inliers(options: Any) -> None:
+    options.mapper.abs_pose_min_num_inliers = LATE_INLIERS
+    options.mapper.abs_pose_min_inlier_ratio = LATE_INLIER_RATIO
 
 
 def lenses_of(work: Workplace, names: Collection[str]) -> set[int]:

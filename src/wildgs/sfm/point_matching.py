@@ -72,7 +72,7 @@ def match_to_points(
                 continue
             nearest = (vlads[placed] @ vlads[row]).topk(min(MAX_PHOTOS, len(placed))).indices.tolist()
             points = _index_points(model, [observed[place] for place in nearest])
-            matches = _solve_photo(database, image_id, points, seed)
+            matches = _solve_photo(database, image_id, points, seed) if len(points.ids) else None
             if matches is not None:
                 _write_matches(database, image_id, *matches, model)
                 found.append(copies[row].work_name)
