@@ -1,6 +1,9 @@
 from dataclasses import replace
 
-from wildgs.sfm.report import SfmReport
+import pytest
+
+from wildgs.sfm.placement import Placement
+from wildgs.sfm.report import FEW_POINTS, SfmReport
 
 REPORT = SfmReport(
     photos=6,
@@ -29,3 +32,12 @@ def test_another_place_is_one_line_instead_of_a_line_per_photo() -> None:
 
 def test_photos_without_a_group_have_a_line_each() -> None:
     assert sum(line.endswith(": another place") for line in REPORT.lines()) == 3
+
+
+@pytest.mark.parametrize(("points", "doubted"), [([10, FEW_POINTS - 1, 400], True), ([10, 60, 70], False)])
+def test_few_points_per_photo_are_said(points: list[int], doubted: bool) -> None:
+    placed = {f"{row}.jpg": Placement("first", count, 0.5, 2) for row, count in enumerate(points)}
+    lines = replace(REPORT, placed=placed).lines()
+    said = [line for line in lines if "half of the photos observe no more than" in line]
+    assert bool(said) == doubted
+    assert not doubted or f"no more than {FEW_POINTS - 1} of the points" in said[0]

@@ -16,6 +16,7 @@ import pycolmap
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lens_priors import USUAL_SHIFT, WIDE_SHIFT, LensPrior, adjust_with_priors
 from wildgs.sfm.lenses import FOCAL_RANGE, corner_shift
+from wildgs.sfm.lookalikes import keeps_agreement
 from wildgs.sfm.workplace import Workplace
 
 LEAST_GROUP = 3
@@ -122,16 +123,22 @@ def run_pipeline(
     return by_size([model for model in models if model.num_points3D()])
 
 
-def measure_distortion(work: Workplace, model: Any, count: int) -> None:
+def measure_distortion(work: Workplace, model: Any, count: int) -> Any:
     """Estimates the distortion of the lenses of a small finished model, which was mapped without.
 
     Args:
         work: The workplace.
-        model: The model; modified.
+        model: The model; not modified.
         count: Number of all photos.
+
+    Returns:
+        The adjusted model; `model` if there is nothing to estimate or most matches contradict it afterwards.
     """
-    if count <= PRIORS_LIMIT and _corner_shift(model, is_wide(model)) is None:
-        _finish(model, _priors(work), USUAL_SHIFT)
+    if count > PRIORS_LIMIT or _corner_shift(model, is_wide(model)) is not None:
+        return model
+    adjusted = pycolmap.Reconstruction(model)
+    _finish(adjusted, _priors(work), USUAL_SHIFT)
+    return adjusted if keeps_agreement(model, adjusted, work.database) else model
 
 
 def adjust_robustly(work: Workplace, model: Any, count: int, constant: Collection[int] = ()) -> None:

@@ -26,6 +26,9 @@ MAX_ERROR = 0.01
 EXACT_ERROR = 0.002
 """The same for matches that count for a model (`count_agreeing`): one pixel of 500."""
 
+LEAST_KEPT = 0.9
+"""Smallest share of these that a changed model still has to agree with."""
+
 AGREEING_SHARE = 0.5
 """Smallest fraction of a pair's matches that must agree with the poses."""
 
@@ -65,6 +68,20 @@ def count_agreeing(model: Any, database_file: Path) -> tuple[int, int]:
         for first, second, matches in _verified(model, database_file)
     ]
     return sum(int(mask.sum()) for mask in agreeing), sum(len(mask) for mask in agreeing)
+
+
+def keeps_agreement(before: Any, after: Any, database_file: Path) -> bool:
+    """Whether a changed model still agrees with most of the matches with which it did before.
+
+    Bundle adjustment of a few photos with a few dozen points may end with poses that explain these points and
+    contradict most matches.
+
+    Args:
+        before: pycolmap's reconstruction.
+        after: One with at least the same photos.
+        database_file: Database with the verified matches.
+    """
+    return count_agreeing(after, database_file)[0] >= LEAST_KEPT * count_agreeing(before, database_file)[0]
 
 
 def verified_matches(
@@ -119,7 +136,7 @@ def agreeing_matches(
         matches: Pairs of their keypoints.
         max_error: Largest distance from the epipolar line, relative to the longer side.
     """
-    places = [_keypoints(image)[matches[:, side]] for side, image in enumerate((first, second))]
+    places = [_places(image, matches[:, side]) for side, image in enumerate((first, second))]
     rays = [unproject(image.camera, points) for image, points in zip((first, second), places, strict=True)]
     essential = essential_matrix(first, second)
     lines = rays[0] @ essential.T, rays[1] @ essential
@@ -132,8 +149,8 @@ def agreeing_matches(
     return fits
 
 
-def _keypoints(image: Any) -> Float64[np.ndarray, "N 2"]:
-    return np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+def _places(image: Any, features: Shaped[np.ndarray, " M"]) -> Float64[np.ndarray, "M 2"]:
+    return np.array([image.point2D(row).xy for row in features.tolist()], dtype=np.float64).reshape(-1, 2)
 
 
 def essential_matrix(first: Any, second: Any) -> Float64[np.ndarray, "3 3"]:

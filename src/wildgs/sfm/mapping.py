@@ -14,7 +14,7 @@ from wildgs.progress import Progress
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.incremental import is_wide, pipeline_options, run_pipeline
 from wildgs.sfm.initial_pairs import LEAST_ANGLE, LEAST_MATCHES, initial_pairs
-from wildgs.sfm.lookalikes import count_agreeing
+from wildgs.sfm.lookalikes import count_agreeing, keeps_agreement
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -196,7 +196,7 @@ def continue_mapping(
         constant_lenses: Working copies whose lenses keep the parameters in the database.
 
     Returns:
-        The larger model, or `model` if no photo could be registered.
+        The larger model, or `model` if no photo could be registered or most matches contradict it afterwards.
     """
     start = work.fresh("start")
     model.write(start)
@@ -207,7 +207,8 @@ def continue_mapping(
     options.multiple_models = False
     next_photo = _counted(progress, model.num_reg_images(), count)
     models = run_pipeline(work, options, count, next_photo, start, constant, wide=is_wide(model))
-    return models[0] if models and models[0].num_reg_images() >= model.num_reg_images() else model
+    grown = bool(models) and models[0].num_reg_images() > model.num_reg_images()
+    return models[0] if grown and keeps_agreement(model, models[0], work.database) else model
 
 
 def _expect_few_inliers(options: Any) -> None:

@@ -61,8 +61,7 @@ def find_poses(
         pairing = Pairing(pairing.name, tuple(sorted({*pairing.pairs, *more})))
     if not models:
         return None
-    measure_distortion(work, models[0], len(copies))
-    models[0] = photos.refine(models[0])
+    models[0] = photos.refine(measure_distortion(work, models[0], len(copies)))
     lenses = drop_impossible(models[0])
     if lenses and config.second_chance:
         models[0] = photos.place_with_plain_lens(models[0], set(lenses))

@@ -15,7 +15,7 @@ from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.guided_matching import GuidedMatches
 from wildgs.sfm.incremental import LEAST_GROUP, by_size
-from wildgs.sfm.lookalikes import find_doubtful
+from wildgs.sfm.lookalikes import find_doubtful, keeps_agreement
 from wildgs.sfm.mapping import (
     continue_mapping,
     lenses_of,
@@ -174,7 +174,8 @@ class Registration:
 
     def _refined(self, model: Any, constant: Collection[int] = ()) -> Any:
         show = counter(self.progress, "matching along epipolar lines")
-        return refine(self.work, model, len(self.copies), self.config, show, self.guided, constant)
+        refined = refine(self.work, model, len(self.copies), self.config, show, self.guided, constant)
+        return refined if keeps_agreement(model, refined, self.work.database) else model
 
     def _more_pairs(self, models: Sequence[Any]) -> set[Pair]:
         """Further pairs for photos without a pose, by retrieval and shared matches, of those that match poorly."""

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from wildgs.files import printable, read_json
@@ -20,6 +21,10 @@ PASSES: Mapping[PassName, str] = {
     "second": "matches to points of the model",
     "third": "more pairs, fewer inliers",
 }
+
+
+FEW_POINTS = 50
+"""Median number of points per photo below which the report doubts the model."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,13 @@ class SfmReport:
             placed = [photo for photo, placement in self.placed.items() if placement.placed_by == name]
             if placed and name != "first":
                 text.append(f"{len(placed)} of them by the {name} pass ({how}): {_some(placed)}")
+        if self.placed:
+            typical = int(median(placement.points for placement in self.placed.values()))
+            if typical < FEW_POINTS:
+                text.append(
+                    f"half of the photos observe no more than {typical} of the points, so that poses may be wrong;"
+                    " add photos that overlap more, taken in between"
+                )
         if self.copies:
             text.append(
                 f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"
