@@ -1,12 +1,15 @@
 from pathlib import Path
 
 import pycolmap
+import pytest
 
 from tests.sfm.conftest import LOST
 from wildgs.progress import silent
+from wildgs.sfm import registration as registration_module
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
+from wildgs.sfm.pairs import Pair
 from wildgs.sfm.placement import NEIGHBOUR_POINTS, count_neighbours
 from wildgs.sfm.registration import Registration, drop_unsure
 from wildgs.sfm.upright import WorkingCopy
@@ -83,3 +86,34 @@ def test_fewer_than_three_photos_are_no_model(matched: tuple[Workplace, list[Wor
     rest = [copy.work_name for copy in copies[:LOST]]
     main = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
     assert registration(work, copies).map_rest(main) == []
+
+
+@pytest.mark.parametrize("few", [True, False])
+@pytest.mark.parametrize("better", [True, False])
+def test_few_photos_are_matched_and_mapped_again(
+    matched: tuple[Workplace, list[WorkingCopy]], monkeypatch: pytest.MonkeyPatch, few: bool, better: bool
+) -> None:
+    """If some have no pose; the new model is kept if it has a higher score."""
+    work, copies = matched
+    names = [copy.work_name for copy in copies]
+    larger = map_photos(work, len(copies), SfmConfig(), silent, only=names[:LOST])[0]
+    smaller = map_photos(work, len(copies), SfmConfig(), silent, only=names[:3])[0]
+    first, again = (smaller, larger) if better else (larger, smaller)
+    pairs: set[Pair] = set()
+    monkeypatch.setattr(registration_module, "AGAIN_LIMIT", len(copies) if few else len(copies) - 1)
+    monkeypatch.setattr(registration_module, "ENOUGH_MATCHES", 10_000)
+    monkeypatch.setattr(registration_module, "forget_pairs", lambda *_: None)
+    monkeypatch.setattr(registration_module, "match_pairs", lambda *a, **_: pairs.update(a[2]))
+    monkeypatch.setattr(registration_module, "match_to_points", lambda *_: [])
+    monkeypatch.setattr(registration_module, "map_repeatedly", lambda *_: [again])
+    monkeypatch.setattr(registration_module, "continue_mapping", lambda work, model, *_, **__: model)
+    monkeypatch.setattr(Workplace, "is_done", lambda self, name: False)
+    monkeypatch.setattr(Workplace, "set_done", lambda self, name: None)
+    photos = registration(work, copies)
+    photos.passes[names[0]] = "second"
+    models, more = photos.try_again([first])
+    assert models[0] is (again if few and better else first)
+    assert (photos.passes == {}) == (few and better)
+    assert more == pairs
+    missing = set(missing_from(first, copies))
+    assert few == any(missing.isdisjoint(pair) for pair in more), "photos with a pose are matched again, too"

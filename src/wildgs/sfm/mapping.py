@@ -127,6 +127,11 @@ class _Best:
             self.models, self.score, self.share = models, score, share
 
 
+def is_better(model: Any, other: Any, work: Workplace) -> bool:
+    """Whether a model has a higher score than another one of the same photos."""
+    return _judge(model, work)[0] > _judge(other, work)[0]
+
+
 def _is_stuck(models: Sequence[Any], count: int) -> bool:
     most = models[0].num_reg_images() if models else 0
     return most < min(STUCK_PHOTOS, STUCK_SHARE * count)
