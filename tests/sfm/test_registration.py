@@ -117,3 +117,6 @@ def test_few_photos_are_matched_and_mapped_again(
     assert more == pairs
     missing = set(missing_from(first, copies))
     assert few == any(missing.isdisjoint(pair) for pair in more), "photos with a pose are matched again, too"
+    assert all(0 not in pair or missing.intersection(pair) for pair in more), (
+        "its matches are those to points"
+    )

@@ -197,21 +197,25 @@ class Registration:
     def _more_pairs(self, models: Sequence[Any]) -> set[Pair]:
         """Further pairs for photos without a pose, by retrieval and shared matches, of those that match poorly.
 
-        Of few photos, all are matched again, because those with a pose have few matches, too.
+        Of few photos, others are matched again, too, because they have few matches as well, except those whose pose
+        is due to their matches to points: matching photos does not find these.
         """
         kept = [photo for photo in range(len(self.copies)) if photo not in self.crops]
-        few = len(self.copies) <= AGAIN_LIMIT
-        missing = set(kept if few or not models else self.missing(models[0]))
+        missing = set(self.missing(models[0]) if models else kept) - self.crops
+        by_points = {photo for photo in kept if self.copies[photo].work_name in self.passes}
+        again = set(kept) - by_points if len(self.copies) <= AGAIN_LIMIT else missing
         with closing(pycolmap.Database.open(self.work.database)) as database:
             matched = verified_pairs(database, self.copies)
         count = self.config.pairing.neighbours
-        wanted = {row: count for row, photo in enumerate(kept) if photo in missing}
+        wanted = {row: count for row, photo in enumerate(kept) if photo in again}
         alike = {(kept[a], kept[b]) for a, b in alike_pairs(self.vlads[kept], wanted)}
-        friends = friends_of_friends(missing - self.crops, matched, count)
+        friends = friends_of_friends(again, matched, count)
         return {
             pair
             for pair in alike | friends
-            if not set(pair) & self.crops and matched.get(pair, 0) < ENOUGH_MATCHES
+            if not set(pair) & self.crops
+            and matched.get(pair, 0) < ENOUGH_MATCHES
+            and (set(pair) & missing or not set(pair) & by_points)
         }
 
 
