@@ -94,7 +94,7 @@ def test_cameras_become_more_exact(made: tuple[Workplace, Any, Any]) -> None:
 
 def test_wrong_matches_move_cameras_less_than_under_squared_errors(made: tuple[Workplace, Any, Any]) -> None:
     work, truth, model = made
-    squared = triangulate(model, dict(verified_matches(model, work.database)), SfmConfig())
+    squared = triangulate(model, dict(verified_matches(model.reg_image_ids(), work.database)), SfmConfig())
     priors = {number: LensPrior.of(lens) for number, lens in squared.cameras.items()}
     adjust_with_priors(squared, priors, corner_shift=USUAL_SHIFT, rounds=8)
     assert error(refined(made), truth) < 0.7 * error(squared, truth)
@@ -148,7 +148,7 @@ def test_triangulation_finds_the_points_of_a_model_without(made: tuple[Workplace
     bare = pycolmap.Reconstruction(truth)
     for point in list(bare.point3D_ids()):
         bare.delete_point3D(point)
-    again = triangulate(bare, dict(verified_matches(bare, work.database)), SfmConfig())
+    again = triangulate(bare, dict(verified_matches(bare.reg_image_ids(), work.database)), SfmConfig())
     assert again.num_points3D() > 0.9 * truth.num_points3D()
     assert bare.num_points3D() == 0
 

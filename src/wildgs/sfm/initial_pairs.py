@@ -16,6 +16,8 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Shaped
 
+from wildgs.sfm.lookalikes import verified_matches
+
 LEAST_MATCHES = 15
 """Smallest number of matches of a pair: COLMAP's for considering it at all."""
 
@@ -48,7 +50,9 @@ def initial_pairs(
         Ids of two images.
     """
     with closing(pycolmap.Database.open(database_file)) as database:
-        matches = _verified_matches(database, names)
+        images = database.read_all_images()
+    photos = [image.image_id for image in images if not names or image.name in names]
+    matches = dict(verified_matches(photos, database_file, LEAST_MATCHES))
     neighbours: dict[int, dict[int, Any]] = defaultdict(dict)
     for (first, second), indices in matches.items():
         neighbours[first][second], neighbours[second][first] = indices, indices[:, ::-1]
@@ -59,20 +63,6 @@ def initial_pairs(
             angle = _angle(database, pair, matches[pair], seed)
         if angle >= LEAST_ANGLE:
             yield pair
-
-
-def _verified_matches(database: Any, names: Collection[str]) -> dict[tuple[int, int], Any]:
-    ids = {image.image_id for image in database.read_all_images() if not names or image.name in names}
-    pairs = [
-        pycolmap.pair_id_to_image_pair(pair_id)
-        for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True)
-        if inliers >= LEAST_MATCHES
-    ]
-    return {
-        pair: np.asarray(database.read_two_view_geometry(*pair).inlier_matches)
-        for pair in pairs
-        if ids.issuperset(pair)
-    }
 
 
 def count_seen(neighbours: Neighbours, first: int, second: int) -> int:

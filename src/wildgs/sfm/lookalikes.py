@@ -8,7 +8,7 @@ visual relations using loop constraints", CVPR 2010.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -85,28 +85,28 @@ def keeps_agreement(before: Any, after: Any, database_file: Path) -> bool:
 
 
 def verified_matches(
-    model: Any, database_file: Path, least: int = 1
+    photos: Collection[int], database_file: Path, least: int = 1
 ) -> Iterator[tuple[tuple[int, int], Shaped[np.ndarray, "_ 2"]]]:
-    """Pairs of photos of a model that have enough verified matches, and these.
+    """Pairs of some photos that have enough verified matches, and these.
 
     Args:
-        model: pycolmap's reconstruction.
+        photos: Ids of the images.
         database_file: Database with the verified matches.
         least: Smallest number of matches of a pair.
 
     Yields:
         The ids of two images, the smaller one first, and indices of their features.
     """
-    registered = set(model.reg_image_ids())
+    wanted = set(photos)
     with closing(pycolmap.Database.open(database_file)) as database:
         for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
             pair = pycolmap.pair_id_to_image_pair(pair_id)
-            if inliers >= least and registered.issuperset(pair):
+            if inliers >= least and wanted.issuperset(pair):
                 yield pair, database.read_two_view_geometry(*pair).inlier_matches
 
 
 def _verified(model: Any, database_file: Path) -> Iterator[tuple[Any, Any, Shaped[np.ndarray, "M 2"]]]:
-    for (first, second), matches in verified_matches(model, database_file, LEAST_MATCHES):
+    for (first, second), matches in verified_matches(model.reg_image_ids(), database_file, LEAST_MATCHES):
         yield model.image(first), model.image(second), matches
 
 

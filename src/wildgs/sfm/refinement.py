@@ -72,7 +72,7 @@ def refine(
     Returns:
         A model with the same photos.
     """
-    verified = dict(verified_matches(model, work.database))
+    verified = dict(verified_matches(model.reg_image_ids(), work.database))
     known = triangulate(model, verified, config)
     first = _adjusted(work, known, known, verified, count, config, constant)
     if first is None:

@@ -22,7 +22,6 @@ PASSES: Mapping[PassName, str] = {
     "third": "more pairs, fewer inliers",
 }
 
-
 FEW_POINTS = 50
 """Median number of points per photo below which the report doubts the model."""
 
