@@ -1,4 +1,6 @@
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -132,3 +134,26 @@ def test_a_run_killed_while_depth_was_estimated_goes_on_with_it(
     with pytest.raises(KeyboardInterrupt):
         pipeline.run(output / "scene/images", output)
     assert len(estimated) == 2
+
+
+def test_pages_of_a_run_have_its_name(make_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = make_scene(3)
+    output = tmp_path / "my-landmark"
+    output.mkdir()
+    root.rename(output / "scene")
+    written: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(pipeline, "estimate_depth", lambda *_, **__: None)
+    monkeypatch.setattr(pipeline, "load_depth_anything", lambda: None)
+    monkeypatch.setattr(pipeline, "_estimate_poses", lambda *_: None)
+    monkeypatch.setattr(pipeline, "train", lambda *_, **__: SimpleNamespace(steps=7, appearances={}))
+    monkeypatch.setattr(pipeline, "load_run", lambda folder: folder)
+    monkeypatch.setattr(pipeline, "LoadedScene", lambda *_: None)
+    monkeypatch.setattr(pipeline, "evaluate", lambda *_, **__: {})
+    monkeypatch.setattr(pipeline, "write_showcase", lambda *arguments: written.append(arguments[:3]))
+    monkeypatch.setattr(pipeline, "write_scene_page", lambda *arguments: written.append(arguments[1:3]))
+    photos = output / "scene/images"
+    pipeline.run(photos, output)
+    assert written == [
+        (output / "report.html", "my-landmark", "3 photos from images, 7 steps of Wild-GS."),
+        (output / "scene.html", "my-landmark"),
+    ]
