@@ -10,7 +10,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wildgs.engine.config import DensityConfig
+from tests.engine.conftest import SIDE
+from wildgs.engine.config import DensityConfig, WarpConfig
+from wildgs.engine.schedule import ScheduleConfig
 from wildgs.engine.trainer import TrainConfig, Trainer
 from wildgs.model.registry import MethodName, create_method, restore_method
 from wildgs.model.wildgs import WildGS, WildGSConfig
@@ -58,6 +60,22 @@ def test_training_goes_as_on_the_cpu(wall_scene: Scene, tiny_model: WildGSConfig
     assert sum(found[-12:]) == pytest.approx(sum(wanted[-12:]), rel=0.25)
     assert len(cpu.method.gaussians) > len(wall_scene.points)
     assert len(cuda.method.gaussians) == pytest.approx(len(cpu.method.gaussians), rel=0.05)
+
+
+def test_photos_are_displaced_as_on_the_cpu(wall_scene: Scene, tiny_model: WildGSConfig):
+    warp, schedule = (
+        WarpConfig(residuals=False, photos=0, friction=0.0, most=0.1),
+        ScheduleConfig(first_stage=0),
+    )
+    grids = {}
+    for device in ("cpu", "cuda"):
+        config = replace(CONFIG, warp=warp, schedule=schedule)
+        trainer = trainer_on(device, wall_scene, tiny_model, config=config)
+        losses_of(trainer, 4)
+        grids[device] = SIDE * trainer.warps.grids.cpu()
+    assert int(grids["cpu"].flatten(1).any(dim=1).sum()) == 4
+    # In pixels; the renders differ by the rounding of convolutions.
+    torch.testing.assert_close(grids["cuda"], grids["cpu"], atol=0.02, rtol=0)
 
 
 def test_graphs_change_nothing_but_speed(wall_scene: Scene, tiny_model: WildGSConfig):
