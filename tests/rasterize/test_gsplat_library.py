@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import filelock
 import pytest
 import torch
 from torch import Tensor
@@ -190,6 +193,59 @@ def test_a_build_is_found_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     (tmp_path / "gsplat_cuda").mkdir()
     (tmp_path / "gsplat_cuda" / "gsplat_cuda.so").write_bytes(b"")
     assert gsplat_library.is_built()
+
+
+def extension_that(monkeypatch: pytest.MonkeyPatch, folder: Path, does: Callable[[], None]) -> None:
+    """Stands for gsplat's extension, which does something while it is loaded."""
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(folder))
+    module = ModuleType("gsplat.cuda._backend")
+
+    def load(name: str) -> Any:
+        does()
+        return Extension()
+
+    module.__getattr__ = load  # type: ignore[method-assign]
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", module)
+
+
+def test_one_process_builds_while_others_wait(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Six trainings that started together built the extension six times side by side."""
+    root, locked = tmp_path / "new", []
+
+    def is_locked() -> bool:
+        other = filelock.FileLock(root / "wildgs_gsplat_build.lock")
+        try:
+            with other.acquire(timeout=0):
+                return False
+        except filelock.Timeout:
+            return True
+
+    extension_that(monkeypatch, root, lambda: locked.append(is_locked()))
+    gsplat_library.require_extension()
+    assert locked == [True]
+    assert not is_locked()
+
+
+def test_a_folder_that_cannot_be_locked_is_no_obstacle(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    (tmp_path / "file").touch()
+    loaded = []
+    extension_that(monkeypatch, tmp_path / "file" / "folder", lambda: loaded.append(True))
+    gsplat_library.require_extension()
+    assert loaded == [True]
+
+
+@pytest.mark.parametrize(("after", "lines"), [(0.0, 1), (30.0, 0)])
+def test_a_long_build_is_announced(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    after: float,
+    lines: int,
+):
+    monkeypatch.setattr(gsplat_library, "ANNOUNCE_AFTER", after)
+    extension_that(monkeypatch, tmp_path, lambda: time.sleep(0.3))
+    gsplat_library.require_extension()
+    assert capsys.readouterr().err.count("building gsplat's CUDA extension") == lines
 
 
 def test_an_interrupted_build_is_not_deleted(tmp_path: Path):

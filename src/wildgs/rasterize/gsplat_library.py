@@ -10,6 +10,8 @@ import os
 import re
 import shutil
 import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -17,10 +19,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import filelock
 import torch
 
 from wildgs.errors import UserError
 
+ANNOUNCE_AFTER = 10.0
+"""Seconds after which a line says that the extension is being built; loading it takes a few."""
 REQUIREMENT = "gsplat>=1.5.3,<1.6"
 _FIRST, _BEFORE = (1, 5, 3), (1, 6)
 _CALLS = {
@@ -116,7 +121,7 @@ def require_extension() -> None:
         UserError: nvcc is missing, or the build failed.
     """
     try:
-        with _interrupted_builds_continue():
+        with _one_builder(), _announced_build(), _interrupted_builds_continue():
             extension = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # torch's build raises many kinds of errors
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -125,6 +130,49 @@ def require_extension() -> None:
         raise UserError(
             f"gsplat could not build its CUDA extension, because it found no nvcc: {build_help()}"
         )
+
+
+@contextmanager
+def _one_builder() -> Iterator[None]:
+    """Makes processes that start together wait for the one that builds.
+
+    gsplat removes torch's lock of the build folder when it starts, so that each of them would build everything. An
+    installed extension is loaded without a lock, and so is any on a file system without locks.
+    """
+    if importlib.util.find_spec("gsplat.csrc") is not None:
+        yield
+        return
+    root = build_root()
+    lock = filelock.FileLock(root / "wildgs_gsplat_build.lock")
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except (OSError, NotImplementedError):
+        pass
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def _announced_build() -> Iterator[None]:
+    """Says why nothing happens while the extension is built; gsplat does not where options have changed."""
+    timer = threading.Timer(ANNOUNCE_AFTER, _announce)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _announce() -> None:
+    print(
+        "wildgs: building gsplat's CUDA extension (2 to 15 minutes; kept on disk for later runs)",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 @contextmanager
@@ -158,12 +206,17 @@ def is_built() -> bool:
     """Whether gsplat's CUDA extension is installed, or already built with the installed torch."""
     if importlib.util.find_spec("gsplat.csrc") is not None:
         return True
-    from torch.utils.cpp_extension import get_default_build_root
-
-    root = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root())
+    root = build_root()
     names = ("gsplat_cuda/gsplat_cuda.*", "*/gsplat_cuda/gsplat_cuda.*")
     built = [path for name in names for path in root.glob(name)]
     return any(path.suffix in (".so", ".pyd") for path in built)
+
+
+def build_root() -> Path:
+    """The folder in which torch builds extensions."""
+    from torch.utils.cpp_extension import get_default_build_root
+
+    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or get_default_build_root())
 
 
 def toolkit_problem() -> str | None:
