@@ -160,6 +160,7 @@ class Trainer:
         set_precision(self.method, precision)
         switch_replays(self.method, self.cuda_graphs)
         self.loss.switch(self.cuda_graphs)
+        self.warps.replays.switch(self.cuda_graphs)
         keep_features(self.method, FeatureCache(self.feature_cache))
 
     def end(self) -> None:
@@ -167,6 +168,7 @@ class Trainer:
         set_precision(self.method, torch.float32)
         switch_replays(self.method, False)
         self.loss.switch(False)
+        self.warps.replays.switch(False)
         keep_features(self.method, None)
         self._process.end()
 

@@ -129,14 +129,6 @@ def test_nothing_to_register_moves_nothing(kind: str) -> None:
     warp(photo, found)
 
 
-@pytest.mark.cuda
-def test_a_gpu_finds_and_applies_the_same_displacements() -> None:
-    photo, render, grid = crop(texture(12)), crop(texture(12), 0.4, -0.3), constant(0.5, 0.2)
-    found = displacement(photo.cuda(), render.cuda(), CELLS).cpu()
-    torch.testing.assert_close(found, displacement(photo, render, CELLS), atol=1e-5, rtol=1e-3)
-    torch.testing.assert_close(warp(photo.cuda(), grid.cuda()).cpu(), warp(photo, grid), atol=1e-4, rtol=0)
-
-
 def warps_of(
     scene: Scene,
     config: WarpConfig,

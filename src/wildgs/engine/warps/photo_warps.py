@@ -23,6 +23,7 @@ from wildgs.devices import upload
 from wildgs.engine.config import WarpConfig
 from wildgs.engine.team import Team
 from wildgs.engine.warps.registration import SIDE, displacement
+from wildgs.engine.warps.replays import FunctionReplays
 from wildgs.priors.measured_displacements import measured_displacements
 from wildgs.priors.resampling import warp
 from wildgs.scene import View
@@ -37,6 +38,7 @@ class PhotoWarps:
         learns: Whether displacements are updated from the second stage on.
         grids: Displacements of each photo, in order of the views: (x, y) in each cell, in units of the photo's
             longer side. The warped photo at pixel p is the photo at p plus the displacement.
+        replays: CUDA graphs of displacing and registering photos.
     """
 
     grids: Float[Tensor, "V 2 G G"]
@@ -61,7 +63,7 @@ class PhotoWarps:
             residuals: Residuals of structure from motion by the photos' names.
             used: Whether the method's photos are warped.
         """
-        self._config, self._begin = config, begin
+        self._config, self._begin, self.replays = config, begin, FunctionReplays()
         self._rows = {view.name: row for row, view in enumerate(views)}
         learns = config.rate > 0 and len(views) >= config.photos
         first = torch.zeros(len(views), 2, config.cells, config.cells)
@@ -76,9 +78,8 @@ class PhotoWarps:
 
     def warped(self, view: View, photo: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         """The photo at its present displacements."""
-        return warp(photo, self.grids[self._rows[view.name]]) if self.is_used else photo
+        return self.replays(warp, photo, self.grids[self._rows[view.name]]) if self.is_used else photo
 
-    @torch.no_grad()
     def update(
         self,
         view: View,
@@ -98,12 +99,23 @@ class PhotoWarps:
         """
         if not self.learns or step < self._begin:
             return
-        row, config = self._rows[view.name], self._config
-        side, first = min(SIDE, max(photo.shape[:2])), self._first[row]
-        moved = self.grids[row] - first + config.rate * displacement(photo, render, config.cells)
-        moved = functional.softshrink(side * moved, config.friction) / side
-        for index, found in team.exchange(row, (first + moved).clamp(-config.most, config.most)):
+        row = self._rows[view.name]
+        improved = self.replays(self._improved, photo, render, self.grids[row], self._first[row])
+        for index, found in team.exchange(row, improved):
             self.grids[index] = found
+
+    def _improved(
+        self,
+        photo: Float[Tensor, "H W 3"],
+        render: Float[Tensor, "H W 3"],
+        grid: Float[Tensor, "2 G G"],
+        first: Float[Tensor, "2 G G"],
+    ) -> Float[Tensor, "2 G G"]:
+        """Displacements `grid`, which began as `first`, after one step of registration."""
+        config, side = self._config, min(SIDE, max(photo.shape[:2]))
+        moved = grid - first + config.rate * displacement(photo, render, config.cells)
+        moved = functional.softshrink(side * moved, config.friction) / side
+        return (first + moved).clamp(-config.most, config.most)
 
     def tensors(self) -> list[Tensor]:
         """What has to be the same on all ranks, which may compute it with other libraries of linear algebra."""
