@@ -44,7 +44,8 @@ done
 python=${PYTHON:-python3}
 steps=${STEPS:-30000}
 [ -n "$budget" ] || budget=$([ -n "$dry" ] && echo 3000 || echo 540)
-reserve=170 # seconds of the budget for training, scores and packing
+reserve=170 # seconds of the budget for training, scores and packing, where a training follows
+[[ " ${stages[*]} " == *" train "* ]] || reserve=0
 parts=$output/parts
 export PYTHONPATH="$root/src:$root/benchmarks:$root${PYTHONPATH:+:$PYTHONPATH}" HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1}
 export TORCH_EXTENSIONS_DIR=${TORCH_EXTENSIONS_DIR:-$output/extensions}
