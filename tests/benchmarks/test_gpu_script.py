@@ -60,12 +60,23 @@ def test_every_stage_runs_and_leaves_its_result(forking_python: Path, landmark: 
         assert {"gpu.json", "parts/stages.jsonl", "parts/steps.out"} <= set(archive.getnames())
 
 
-def test_earlier_stages_leave_time_to_training(forking_python: Path, tmp_path: Path):
+def exit_codes(output: Path) -> list[int]:
+    lines = (output / "parts" / "stages.jsonl").read_text().splitlines()
+    return [json.loads(line)["exit_code"] for line in lines]
+
+
+def test_earlier_stages_leave_time_to_training(forking_python: Path, landmark: Path, tmp_path: Path):
     """A budget that is smaller than what training reserves goes to training alone, and every stage says so."""
-    done = call(forking_python, tmp_path, "--dry-run", "--budget", 100, "build", "eager")
+    options = ("--dry-run", "--scene", landmark, "--budget", 100)
+    done = call(forking_python, tmp_path, *options, "build", "eager", "train")
     assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "parts" / "stages.jsonl").read_text().splitlines()
-    assert [json.loads(line)["exit_code"] for line in lines] == [124, 124]
+    assert exit_codes(tmp_path) == [124, 124, 0]
+
+
+def test_without_a_training_all_time_goes_to_the_other_stages(forking_python: Path, tmp_path: Path):
+    done = call(forking_python, tmp_path, "--dry-run", "--budget", 100, "build")
+    assert done.returncode == 0, done.stderr
+    assert exit_codes(tmp_path) == [0]
 
 
 def test_an_unknown_stage_is_named(forking_python: Path, tmp_path: Path):
