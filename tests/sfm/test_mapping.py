@@ -30,11 +30,12 @@ class FakeModel:
 @pytest.mark.parametrize(
     ("runs", "agreeing", "few", "best", "tried"),
     [
-        ([["a", "b", "c"], ["a"]], 0.6, False, 0, 2),  # all photos have a pose
-        ([["a"], ["a", "b", "c"]], 0.6, False, 1, 2),
+        ([["a", "b", "c"], ["a"]], 0.8, False, 0, 2),  # all photos have a pose, and most matches agree
+        ([["a"], ["a", "b", "c"]], 0.8, False, 1, 2),
+        ([["a", "b", "c"], ["a"], ["b"]], 0.6, False, 0, 3),
         ([["a"], ["a", "b"], []], 0.6, False, 1, 3),
         ([[], ["a"], []], 0.6, False, 1, 3),
-        ([["a", "b", "c"], ["a"]], 0.8, True, 0, 2),  # and most matches agree
+        ([["a", "b", "c"], ["a"]], 0.8, True, 0, 2),
         ([["a", "b"], ["a", "b", "c"], ["a"], []], 0.6, True, 1, 4),
         ([[], [], [], []], 0.6, True, None, 4),
     ],
@@ -99,16 +100,22 @@ def test_matches_that_agree_outweigh_points(
 
 
 @pytest.mark.parametrize(
-    ("sizes", "photos", "tried"),
+    ("sizes", "share", "photos", "tried"),
     [
-        ([2, 12, 11, 13, 14], 13, 4),  # the best of three models that grew, of which the last is not tried
-        ([2, 3, 0, 12, 2], 12, 5),
-        ([9, 12, 12, 12], 12, 4),
-        ([10, 12], 10, 1),  # not stuck
+        ([2, 12, 11, 13, 14, 15, 16], 0.9, 15, 6),  # the best of five models that grew
+        ([2, 3, 0, 12, 2], 0.9, 12, 5),
+        ([9, 12, 12, 12, 12, 12, 12], 0.5, 12, 6),
+        ([10, 12], 0.9, 10, 1),  # not stuck, and most matches agree
+        ([10, 12, 3, 14], 0.5, 14, 4),  # too few agree
     ],
 )
-def test_other_initial_pairs_are_tried_where_a_model_does_not_grow(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sizes: list[int], photos: int, tried: int
+def test_other_initial_pairs_are_tried_where_a_model_does_not_grow_or_agree(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    sizes: list[int],
+    share: float,
+    photos: int,
+    tried: int,
 ) -> None:
     copies = [WorkingCopy(f"{row}.jpg", f"{row}", f"{row}.jpg", False) for row in range(40)]
     pairs = [(row, row + 1) for row in range(len(sizes) - 1)]
@@ -121,7 +128,7 @@ def test_other_initial_pairs_are_tried_where_a_model_does_not_grow(
 
     monkeypatch.setattr(mapping, "map_photos", run)
     monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(pairs))
-    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (0, 1))
+    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (int(10 * share), 10))
     monkeypatch.setattr(mapping, "is_wide", lambda model: True)
     models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
     assert models[0].num_reg_images() == photos
