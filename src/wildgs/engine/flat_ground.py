@@ -23,7 +23,7 @@ from wildgs.model.dropout import rareness
 from wildgs.model.gaussians import Gaussians
 from wildgs.model.method import Method
 from wildgs.priors.depth_points import depth_points
-from wildgs.priors.ground import ground_plane, heights_above
+from wildgs.priors.ground_plane import ground_plane, heights_above
 from wildgs.scene import Scene
 
 EVERY = 10
@@ -72,7 +72,7 @@ class _Ground:
         def surface() -> Float[Tensor, "P 3"]:
             return torch.cat([scene.points, depth_points(scene, initial.depth_points)[0]])
 
-        plane = ground_plane(scene.points, surface, centers, initial.ground.tolerance)
+        plane = ground_plane(scene.points, surface, centers)
         if plane is None:
             return None
         above = heights_above(plane, centers)

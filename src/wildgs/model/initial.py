@@ -18,7 +18,8 @@ from wildgs.model.sky import COLOR as SKY_COLOR
 from wildgs.model.sky import sky_points
 from wildgs.priors.config import GroundConfig
 from wildgs.priors.depth_points import depth_points
-from wildgs.priors.ground import GroundPoints, ground_plane, ground_points
+from wildgs.priors.ground import GroundPoints, ground_points
+from wildgs.priors.ground_plane import ground_plane
 from wildgs.scene import Scene
 
 ColoredPoints = tuple[Float[Tensor, "_ 3"], UInt8[Tensor, "_ 3"]]
@@ -111,7 +112,7 @@ def _ground_below(
     if not (cameras and config.points):
         return None
     centers = torch.stack([camera.position for camera in cameras])
-    return ground_plane(sparse, lambda: surface, centers, config.tolerance)
+    return ground_plane(sparse, lambda: surface, centers)
 
 
 def initial_from_points(

@@ -1,4 +1,4 @@
-"""Ground completion: fits a plane to the ground points and continues it around the cameras.
+"""Ground completion: continues the plane of the ground around the cameras.
 
 Photos of a landmark rarely show the paving in front of the photographer. SfM cannot triangulate surfaces that fewer
 than two photos show, so a novel view in that direction would see through the scene to the background.
@@ -7,7 +7,7 @@ than two photos show, so a novel view in that direction would see through the sc
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,25 +17,14 @@ from torch import Tensor
 
 from wildgs.geometry.camera import Camera
 from wildgs.priors.config import GroundConfig
+from wildgs.priors.ground_plane import height_at, heights_above
 
-_HYPOTHESES = 512
-_STEEPEST = 0.15
-"""Maximum slope of the ground; steeper planes are walls, roofs or flights of stairs."""
-_LEAST_SHARE = 0.2
-"""Minimum share of inliers among the points below the cameras; a plane with fewer is some other level surface."""
-_LEAST_ABOVE = 0.9
-"""Minimum share of the cameras above the plane."""
-_LEAST_POINTS = 50
-_NEAR_SHARE = 0.05
-"""Tolerance of the refined plane, relative to the height of the lowest cameras above it. An error of the plane by
-so much is one of the depth of the ground by as much."""
 _MAX_CELLS = 2_000_000
 """Maximum number of grid cells; in a larger grid, only cells around the cameras are considered."""
 _MOST_DIVISIONS = 6
 """Number of times that a cell is divided into four at most."""
 _NEAREST = 0.5
 """Depth, in units of a cell's side, below which a cell's image does not grow any further."""
-_MAX_POINTS = 20_000  # for RANSAC; more do not improve the plane, and memory is 512 times as many numbers
 
 
 @dataclass(frozen=True)
@@ -72,7 +61,7 @@ class GroundPoints:
         """Four points in the cell of each one, at half the distance from each other."""
         corners = torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]]).to(self.points)
         places = (self.points[:, None, :2] + self.spacing[:, None, None] / 4 * corners).reshape(-1, 2)
-        points = torch.cat([places, (_padded(places) @ plane)[:, None]], dim=1)
+        points = torch.cat([places, height_at(plane, places)[:, None]], dim=1)
         return GroundPoints(
             points, self.colors.repeat_interleave(4, dim=0), (self.spacing / 2).repeat_interleave(4)
         )
@@ -90,7 +79,7 @@ def ground_points(
     Args:
         points: Points of the scene in the aligned frame (+z up).
         colors: Colours of the points; new points take the colour of the nearest ground point.
-        plane: The ground; see `find_ground`.
+        plane: The ground; see `wildgs.priors.ground_plane`.
         cameras: Cameras of the training photos, at the size of training.
         config: Number, spacing and extent of the new points.
 
@@ -99,7 +88,7 @@ def ground_points(
     """
     if plane is None or config.points == 0 or len(cameras) == 0:
         return GroundPoints(points[:0], colors[:0], points[:0, 0])
-    members = _members(points, plane[None], config.tolerance)[0]
+    members = _members(points, plane, config.tolerance)
     feet, known = torch.stack([camera.position for camera in cameras])[:, :2], points[members]
     places = _places_around(feet, config)
     distance = torch.from_numpy(KDTree(feet.numpy()).query(places.numpy())[0])
@@ -107,7 +96,7 @@ def ground_points(
     chosen = ((distance < config.reach) & (gap > config.spacing)).nonzero()[:, 0]
     most = math.ceil(config.points / 2) if config.most_pixels else config.points
     chosen = chosen[distance[chosen].argsort(stable=True)[:most]]
-    places = torch.cat([places[chosen], (_padded(places[chosen]) @ plane)[:, None]], dim=1)
+    places = torch.cat([places[chosen], height_at(plane, places[chosen])[:, None]], dim=1)
     found = GroundPoints(
         places, colors[members][nearest[chosen]], torch.full((len(places),), config.spacing).to(places)
     )
@@ -167,120 +156,6 @@ def _places_around(feet: Float[Tensor, "V 2"], config: GroundConfig) -> Float[Te
     return (low + cells * config.spacing).to(feet.dtype)
 
 
-def ground_plane(
-    sparse: Float[Tensor, "P 3"],
-    surface: Callable[[], Float[Tensor, "Q 3"]],
-    centers: Float[Tensor, "V 3"],
-    tolerance: float,
-) -> Float[Tensor, "3"] | None:
-    """Finds the ground by the points of SfM, or by further points where those are too few.
-
-    Where photos disagree about the depth of the ground, points from depth maps lie in several layers
-    (`wildgs.priors.depth_points`), which lowers the plane by a tenth of a photographer's height on one scene.
-
-    Args:
-        sparse: Points of SfM.
-        surface: Gives these and points from depth maps; called if it is needed.
-        centers: Camera centres.
-        tolerance: See `GroundConfig`.
-
-    Returns:
-        See `find_ground`.
-    """
-    plane = find_ground(sparse, centers, tolerance, torch.Generator().manual_seed(0))
-    if plane is None and len(points := surface()) > len(sparse):
-        return find_ground(points, centers, tolerance, torch.Generator().manual_seed(0))
-    return plane
-
-
-def find_ground(
-    points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"], tolerance: float, generator: torch.Generator
-) -> Float[Tensor, "3"] | None:
-    """Finds the level plane below the cameras with the most inliers, and refines it (see `_refined`).
-
-    Returns:
-        a, b and c of ``z = a x + b y + c``; None if every plane has too few inliers, or cameras lie below it.
-    """
-    below = points[points[:, 2] < centers[:, 2].median()]
-    if len(below) < _LEAST_POINTS:
-        return None
-    if len(below) > _MAX_POINTS:
-        below = below[torch.randperm(len(below), generator=generator)[:_MAX_POINTS]]
-    plane = _level_plane(below, tolerance, generator)
-    if plane is None:
-        return None
-    best = _members(below, plane[None], tolerance)[0]
-    above = centers[:, 2] > _padded(centers) @ plane
-    if float(best.float().mean()) < _LEAST_SHARE or float(above.float().mean()) < _LEAST_ABOVE:
-        return None
-    return _refined(below, centers, plane, tolerance, generator)
-
-
-def _refined(
-    points: Float[Tensor, "P 3"],
-    centers: Float[Tensor, "V 3"],
-    plane: Float[Tensor, "3"],
-    tolerance: float,
-    generator: torch.Generator,
-) -> Float[Tensor, "3"]:
-    """The plane with the most inliers near a coarse one, within a tolerance that fits the cameras' height.
-
-    Steps, kerbs and plinths within the coarse tolerance raise and tilt the plane. At eye height, an error of a
-    tenth of the height already moves the ground at the feet of a photographer by a tenth of its distance.
-    """
-    heights = centers[:, 2] - _padded(centers) @ plane
-    narrow = min(tolerance, _NEAR_SHARE * float(heights.quantile(0.1)))
-    near = _lowest(points[_members(points, plane[None], 2 * tolerance)[0]], 2 * tolerance)
-    finer = _level_plane(near, narrow, generator) if narrow > 0 else None
-    if finer is None or not bool((centers[:, 2] > _padded(centers) @ finer)[heights > 0].all()):
-        return plane
-    return finer
-
-
-def _lowest(points: Float[Tensor, "P 3"], cell: float) -> Float[Tensor, "Q 3"]:
-    """The lowest point of each cell of a horizontal grid, so that a plane counts by its area."""
-    index = (points[:, :2] / cell).floor().long()
-    _, member = index.unique(dim=0, return_inverse=True)
-    order = points[:, 2].argsort(stable=True)
-    first = torch.full((int(member.max()) + 1,), len(points), dtype=torch.int64) if len(points) else member
-    first.scatter_reduce_(0, member[order], torch.arange(len(points)), "amin")
-    return points[order[first]]
-
-
-def _level_plane(
-    points: Float[Tensor, "P 3"], tolerance: float, generator: torch.Generator
-) -> Float[Tensor, "3"] | None:
-    """The level plane with the most inliers (RANSAC, then least squares); None if it has too few."""
-    triples = points[torch.randint(len(points), (_HYPOTHESES, 3), generator=generator)].double()
-    rows = _padded(triples)
-    usable = torch.linalg.det(rows).abs() > 1e-6
-    hypotheses = torch.linalg.solve(rows[usable], triples[usable][..., 2]).float()
-    hypotheses = hypotheses[hypotheses[:, :2].norm(dim=1) < _STEEPEST]
-    if len(hypotheses) == 0:
-        return None
-    members = _members(points, hypotheses, tolerance)
-    best, plane = members[int(members.sum(dim=1).argmax())], None
-    for _ in range(2):
-        if int(best.sum()) < _LEAST_POINTS:
-            return None
-        known = points[best].double()
-        plane = torch.linalg.lstsq(_padded(known), known[:, 2:]).solution[:, 0].float()
-        best = _members(points, plane[None], tolerance)[0]
-    return plane
-
-
-def heights_above(plane: Float[Tensor, "3"], points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
-    """Vertical distance of points from a plane of `find_ground`, negative below it."""
-    return points[..., 2] - _padded(points) @ plane
-
-
-def _padded(points: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 3"]:
-    """(x, y, 1) of points; the product with a plane's coefficients is its height at that position."""
-    return torch.cat([points[..., :2], torch.ones_like(points[..., :1])], dim=-1)
-
-
-def _members(
-    points: Float[Tensor, "P 3"], planes: Float[Tensor, "H 3"], tolerance: float
-) -> Bool[Tensor, "H P"]:
-    """Inliers of each plane."""
-    return (points[:, 2] - planes @ _padded(points).T).abs() < tolerance
+def _members(points: Float[Tensor, "P 3"], plane: Float[Tensor, "3"], tolerance: float) -> Bool[Tensor, " P"]:
+    """Points close to a plane."""
+    return heights_above(plane, points).abs() < tolerance

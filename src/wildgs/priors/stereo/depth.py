@@ -14,8 +14,8 @@ from torch import Tensor
 
 from wildgs.errors import WildGSWarning
 from wildgs.files import written_aside
-from wildgs.priors.config import GroundConfig, StereoConfig
-from wildgs.priors.ground import find_ground
+from wildgs.priors.config import StereoConfig
+from wildgs.priors.ground_plane import find_ground
 from wildgs.priors.measured_displacements import measured_displacements
 from wildgs.priors.stereo.agreement_kernels import count_agreeing, drop_specks
 from wildgs.priors.stereo.neighbours import choose_neighbours, seen_rows
@@ -81,7 +81,7 @@ def stereo_depth(
 
 def _ground(scene: Scene) -> Float[Tensor, "3"] | None:
     centers = torch.stack([view.camera.position for view in scene.train_views])
-    return find_ground(scene.points, centers, GroundConfig().tolerance, torch.Generator().manual_seed(0))
+    return find_ground(scene.points, centers)
 
 
 def agreed_depth(
