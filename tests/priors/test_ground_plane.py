@@ -100,7 +100,7 @@ def test_a_ledge_is_no_ground() -> None:
 
 def test_most_cameras_may_be_higher() -> None:
     """Photos from windows and hills beside those from the street."""
-    centers = torch.cat([eyes(0.1), eyes(0.1, 6, seed=1) + torch.tensor([0.0, 0.0, 0.5])])
+    centers = torch.cat([eyes(0.1), eyes(0.1, 30, seed=1) + torch.tensor([0.0, 0.0, 0.5])])
     plane = find_ground(torch.cat([paving(noise=0.002), wall()]), centers)
     assert plane is not None
     assert float(height_at(plane, torch.zeros(2))) == pytest.approx(-0.5, abs=0.005)

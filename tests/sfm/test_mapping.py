@@ -133,3 +133,27 @@ def test_other_initial_pairs_are_tried_where_a_model_does_not_grow_or_agree(
     models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
     assert models[0].num_reg_images() == photos
     assert asked == [None] * mapping.FIRST_ATTEMPTS + pairs[: tried - 1]
+
+
+@pytest.mark.parametrize(("shares", "best"), [((0.6, 0.65), 1), ((0.6, 0.58), 0), ((0.6, 0.58, 0.61), 2)])
+def test_other_pairs_have_to_be_more_exact_unless_the_model_is_stuck(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], best: int
+) -> None:
+    """More photos with worse poses are not better: later passes find them as well."""
+    copies = [WorkingCopy(f"{row}.jpg", f"{row}", f"{row}.jpg", False) for row in range(40)]
+    pairs = [(row, row + 1) for row in range(len(shares) - 1)]
+
+    def run(*_: object, pair: tuple[int, int] | None, wide: bool = False) -> list[FakeModel]:
+        number = 0 if pair is None else 1 + pair[0]
+        return [FakeModel([f"{row}" for row in range(30 + number)], number)]
+
+    def agreeing(model: FakeModel, *_: object) -> tuple[int, int]:
+        return int(100_000 * shares[model.observations]), 100_000
+
+    monkeypatch.setattr(mapping, "map_photos", run)
+    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(pairs))
+    # More photos have more matches, too.
+    monkeypatch.setattr(mapping, "_judge", lambda model, _: (len(model.names), agreeing(model)[0] / 100_000))
+    monkeypatch.setattr(mapping, "is_wide", lambda model: True)
+    models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    assert models[0].observations == best

@@ -48,7 +48,8 @@ class GroundConfig:
         most_pixels: Largest distance between neighbouring points in a training photo, in pixels. Where photos are
             nearer, points are denser. 0 = the same distance everywhere.
         reach: Distance from the cameras up to which the ground is extended, in units of the aligned frame.
-        tolerance: Largest distance of an inlier from the ground plane, in units of the aligned frame.
+        tolerance: Largest distance from the ground plane, in units of the aligned frame, of points that show it.
+            It is not extended where they are, and new points take their colours.
     """
 
     points: int = 12_000

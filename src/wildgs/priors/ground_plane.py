@@ -21,12 +21,13 @@ USUAL_SLOPE = 0.06
 """Slope at which a plane needs 1.6 times as clear a layer of points as a horizontal one. The direction upwards,
 which cameras determine, is a few degrees wrong at times, and steeper planes are flights of stairs."""
 HEIGHTS = np.geomspace(0.01, 4.0, 190)
-"""Heights of the cameras above the ground that are tried, in units of the aligned frame."""
-THICKNESS, THICKEST = 0.06, 0.03
+"""Usual heights of cameras above the ground that are tried, in units of the aligned frame."""
+THICKNESS, THICKEST = 0.07, 0.03
 """Largest distance of a point on the ground from its plane, relative to the height of the cameras above it, and in
 units of the aligned frame."""
-LEAST_HEIGHT = 0.4
-"""Height of the lowest tenth of the cameras relative to the median, at least."""
+LOWEST_CAMERAS, USUAL_CAMERAS, LEAST_HEIGHT = 0.1, 0.3, 0.4
+"""Two quantiles of the cameras' heights, and the first one relative to the second, at least. Most photos may be
+from hills and windows."""
 LEAST_BREADTH = 0.1
 """Standard deviation of the points on the ground across their main direction, at least, relative to that along it:
 ledges of walls are level, too."""
@@ -34,8 +35,8 @@ LEAST_POINTS = 30
 LEAST_CLEAR, PER_DOUBLING = 4.0, 0.4
 """Excess of the points on the plane over those in the layers above and below it, in standard deviations, of 300
 points or fewer, and how much more it must be of twice as many, among which more layers are clear by chance. The
-true ground of `gate` has 4.1 with 40 photos and 7 with 90, and 5 to 21 by stereo of 10 and 20; where `longchamp`
-and `temple` have no level ground, the best plane has 2.6 to 3.9."""
+true ground of `gate` has 4.7 with 40 photos and 8 with 90, and 5.6 and 21 by stereo of 10 and 20; where `longchamp`
+and `temple` have no level ground, the best plane has 2.8 to 3.5."""
 CELL = (0.04, 0.04, 0.004)
 """Size of the cells of which one point each is kept, so that planes count by area: stairs have more points than
 paving."""
@@ -137,7 +138,7 @@ def _clearest(points: Float64[np.ndarray, "P 3"], centers: Float64[np.ndarray, "
     """The layer of all slopes and heights that has the clearest excess of points."""
     slopes, thickness = _slopes(), (THICKNESS * HEIGHTS).clip(max=THICKEST)
     eyes = centers[:, 2] - slopes @ centers[:, :2].T
-    planes = np.median(eyes, axis=1)[:, None] - HEIGHTS
+    planes = np.quantile(eyes, USUAL_CAMERAS, axis=1)[:, None] - HEIGHTS
     edges = planes[:, None] + np.array([-2, -1, 1, 2])[:, None] * thickness
     found = np.empty(edges.shape, np.int64)
     for slope, wanted, counts in zip(slopes, edges, found, strict=True):
@@ -146,7 +147,7 @@ def _clearest(points: Float64[np.ndarray, "P 3"], centers: Float64[np.ndarray, "
     beside = found[:, 3] - found[:, 0] - inside
     clear = (inside - beside) / np.sqrt(inside + beside + 1)
     clear *= np.exp(-np.square(slopes).sum(axis=1) / (2 * USUAL_SLOPE**2))[:, None]
-    lowest = np.quantile(eyes, 0.1, axis=1)[:, None] - planes
+    lowest = np.quantile(eyes, LOWEST_CAMERAS, axis=1)[:, None] - planes
     clear[(inside < LEAST_POINTS) | (lowest < LEAST_HEIGHT * HEIGHTS)] = 0
     slope, height = np.unravel_index(clear.argmax(), clear.shape)
     x, y = slopes[slope].tolist()
@@ -169,4 +170,4 @@ def _fitted(layer: _Layer, points: Float[Tensor, "P 3"]) -> Float[Tensor, "3"] |
 def _is_stood_on(plane: Float[Tensor, "3"], centers: Float[Tensor, "V 3"]) -> bool:
     """Whether most cameras are at about the same height above a plane."""
     heights = heights_above(plane, centers)
-    return bool(heights.quantile(0.1) >= LEAST_HEIGHT * heights.median())
+    return bool(heights.quantile(LOWEST_CAMERAS) >= LEAST_HEIGHT * heights.quantile(USUAL_CAMERAS))

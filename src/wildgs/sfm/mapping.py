@@ -100,7 +100,7 @@ def map_repeatedly(
         if not (stuck or doubtful) or grown == (1 if many else GROWN_MODELS):
             break
         models = map_photos(work, len(copies), config, progress, names, pair=pair)
-        best.offer(models)
+        best.offer(models, exact=not stuck)
         grown += not _is_stuck(models, len(photos))
     return best.models
 
@@ -121,12 +121,12 @@ class _Best:
     score: int = -1
     share: float = 0.0
 
-    def offer(self, models: list[Any], *, wide: bool = False) -> None:
-        """Takes the models of a run if they are better."""
+    def offer(self, models: list[Any], *, wide: bool = False, exact: bool = False) -> None:
+        """Takes the models of a run if they are better; with `exact`, only if as large a share of matches agrees."""
         if not models or (wide and not is_wide(models[0])):
             return
         score, share = _judge(models[0], self.work)
-        if score > self.score:
+        if score > self.score and not (exact and share < self.share):
             self.models, self.score, self.share = models, score, share
 
 
