@@ -122,7 +122,7 @@ class _Best:
     share: float = 0.0
 
     def offer(self, models: list[Any], *, wide: bool = False, exact: bool = False) -> None:
-        """Takes the models of a run if they are better; with `exact`, only if as large a share of matches agrees."""
+        """Takes a run's models if they are better; with `exact`, only if as large a share of matches agrees."""
         if not models or (wide and not is_wide(models[0])):
             return
         score, share = _judge(models[0], self.work)
