@@ -79,18 +79,19 @@ def find_ground(points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"]) -> 
     Returns:
         a, b and c of ``z = a x + b y + c``; None if there is no clear layer.
     """
-    if not len(centers):
-        return None
-    below = _thinned(points[points[:, 2] < centers[:, 2].median()].double())
-    if len(below) > MOST_POINTS:
-        chosen = torch.randperm(len(below), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
-        below = below[chosen]
+    below = _below(points, centers)
     if len(below) < LEAST_POINTS:
         return None
     best = _clearest(below.numpy(), centers.double().numpy())
     least = LEAST_CLEAR + PER_DOUBLING * max(0.0, math.log2(len(below) / 300))
     plane = _fitted(best, below) if best.clear >= least else None
     return None if plane is None or not _is_stood_on(plane, centers.double()) else plane.float()
+
+
+def clearness(points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"]) -> float:
+    """Excess of the clearest level layer over the layers above and below it, in standard deviations."""
+    below = _below(points, centers)
+    return _clearest(below.numpy(), centers.double().numpy()).clear if len(below) else 0.0
 
 
 def heights_above(plane: Float[Tensor, "3"], points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
@@ -116,6 +117,15 @@ class _Layer:
     plane: tuple[float, float, float]
     thickness: float
     clear: float
+
+
+def _below(points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"]) -> Float64[Tensor, "Q 3"]:
+    """Points below most cameras, thinned; none without cameras."""
+    if not len(centers):
+        return points[:0].double()
+    below = _thinned(points[points[:, 2] < centers[:, 2].median()].double())
+    chosen = torch.randperm(len(below), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
+    return below[chosen]
 
 
 def _thinned(points: Float[Tensor, "P 3"]) -> Float[Tensor, "Q 3"]:
