@@ -124,8 +124,9 @@ def _below(points: Float[Tensor, "P 3"], centers: Float[Tensor, "V 3"]) -> Float
     if not len(centers):
         return points[:0].double()
     below = _thinned(points[points[:, 2] < centers[:, 2].median()].double())
-    chosen = torch.randperm(len(below), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
-    return below[chosen]
+    if len(below) <= MOST_POINTS:
+        return below
+    return below[torch.randperm(len(below), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]]
 
 
 def _thinned(points: Float[Tensor, "P 3"]) -> Float[Tensor, "Q 3"]:
