@@ -8,6 +8,8 @@ the run,
 
 - error: distance between where a photo shows the collection's points and where its camera in the run projects them,
   in percent of the longer side; median over points, then over photos, and the 90th percentile over photos;
+- cameras: the same between where its camera in the collection projects them and where that in the run does, which
+  has no error of features;
 - focal: absolute logarithm of the ratio of the focal lengths, median and largest.
 
 The last line has means over the runs, of logarithms for the errors.
@@ -61,12 +63,15 @@ class Score:
     points: int
     error: float
     worst_error: float
+    cameras: float
+    worst_cameras: float
     focal: float
     worst_focal: float
 
     def __str__(self) -> str:
         return (
             f"{self.registered} photos, {self.points} points, error {self.error:.2f}% ({self.worst_error:.2f}%),"
+            f" cameras {self.cameras:.3f}% ({self.worst_cameras:.3f}%),"
             f" focal {self.focal:.2f} ({self.worst_focal:.2f})"
         )
 
@@ -147,7 +152,7 @@ def compare(truth: Any, found: Any) -> Score | None:
         print(f"only {len(common[0])} points in common")
         return None
     similarity = fit(*common)
-    errors, focals = [], []
+    errors, between, focals = [], [], []
     for image, other in common_photos(truth, found):
         places, points = seen(truth, image)
         if not len(points):
@@ -157,6 +162,10 @@ def compare(truth: Any, found: Any) -> Score | None:
         scaled = places * side(other.camera) / side(image.camera)
         error = np.median(np.linalg.norm(pixels - scaled, axis=1)) / side(other.camera)
         errors.append(100 * min(float(error), 1.0))
+        exact = image.camera.img_from_cam(image.cam_from_world() * points)
+        exact *= side(other.camera) / side(image.camera)
+        distance = np.median(np.linalg.norm(pixels - exact, axis=1)) / side(other.camera)
+        between.append(100 * min(float(distance), 1.0))
         lengths = [each.camera.mean_focal_length() / side(each.camera) for each in (image, other)]
         focals.append(abs(float(np.log(lengths[1] / lengths[0]))))
     return Score(
@@ -164,6 +173,8 @@ def compare(truth: Any, found: Any) -> Score | None:
         found.num_points3D(),
         float(np.median(errors)),
         float(np.quantile(errors, 0.9)),
+        float(np.median(between)),
+        float(np.quantile(between, 0.9)),
         float(np.median(focals)),
         max(focals),
     )
@@ -201,11 +212,15 @@ def main(command: Command) -> None:
             if score is not None:
                 scores.append(score)
     if scores:
+
+        def mean(name: str) -> float:
+            return float(np.exp(np.mean([np.log(max(getattr(score, name), 1e-3)) for score in scores])))
+
         print(
             f"mean of {len(scores)} runs: {np.mean([s.registered for s in scores]):.1f} photos,"
             f" {np.mean([s.points for s in scores]):.0f} points,"
-            f" error {np.exp(np.mean([np.log(max(s.error, 1e-3)) for s in scores])):.2f}%"
-            f" ({np.exp(np.mean([np.log(max(s.worst_error, 1e-3)) for s in scores])):.2f}%),"
+            f" error {mean('error'):.2f}% ({mean('worst_error'):.2f}%),"
+            f" cameras {mean('cameras'):.3f}% ({mean('worst_cameras'):.3f}%),"
             f" focal {np.mean([s.focal for s in scores]):.2f} ({np.mean([s.worst_focal for s in scores]):.2f})"
         )
 

@@ -1,12 +1,13 @@
-"""Scenes with the cameras that structure from motion has before and after its last adjustment, to train on both.
+"""Scenes with the cameras that structure from motion has before and after its last adjustments, to train on each.
 
     python benchmarks/sfm_refinement.py ../shared/data/temple/images OUT
     python benchmarks/sfm_refinement.py ../shared/data/gate/images OUT --photos 34 --choice 1
     wildgs train OUT/before --output BEFORE --steps 1500 --downscale 2 --density.max-gaussians 40000
 
-`OUT/before` and `OUT/after` have the same photos, so that training holds out the same ones. Photos to which only
-the last adjustment gave a pose are in neither. A line is printed for each: photos, points, observations,
-reprojection error, and the share of the verified matches that agree with the cameras (closer than a pixel of 500).
+`OUT/before`, `OUT/detected` and `OUT/after` have the same photos, so that training holds out the same ones; in the
+second one, features are where they were detected instead of where photos show the same. Photos to which only the
+last adjustments gave a pose are in none. A line is printed for each: photos, points, observations, reprojection
+error, and the share of the verified matches that agree with the cameras (closer than a pixel of 500).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import tyro
 
 import wildgs
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.sfm import reconstruction, registration
+from wildgs.sfm import reconstruction, refinement, registration
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lookalikes import count_agreeing
 from wildgs.sfm.upright import WorkingCopy, list_photos
@@ -33,7 +34,7 @@ from wildgs.sfm.workplace import Workplace
 
 @dataclass(frozen=True)
 class Command:
-    """Writes two scenes of a folder of photos."""
+    """Writes three scenes of a folder of photos."""
 
     photos_folder: tyro.conf.Positional[Path]
     """Folder of photos."""
@@ -62,7 +63,13 @@ class Kept:
     def _keep(self, work: Workplace, model: Any, *rest: Any) -> Any:
         refined = self._refine(work, model, *rest)
         if not (self._output / "before").exists():
-            for name, each in (("before", model), ("after", refined)):
+            move, refinement.refine_keypoints = (
+                refinement.refine_keypoints,
+                lambda work, model, _: (model, set()),
+            )
+            detected = self._refine(work, model, *rest)
+            refinement.refine_keypoints = move
+            for name, each in (("before", model), ("detected", detected), ("after", refined)):
                 self._write(work, each, name)
         return refined
 

@@ -13,6 +13,7 @@ from wildgs.sfm import lens_priors
 from wildgs.sfm.lens_priors import (
     FOCAL_SPREAD,
     KNOWN_FOCAL_SPREAD,
+    ROBUST_SCALE,
     USUAL_SHIFT,
     WIDE_SHIFT,
     LensPrior,
@@ -136,11 +137,13 @@ def test_an_unusable_solution_changes_nothing() -> None:
     assert (focals(model) == before).all()
 
 
-def only_priors(lens: Any, *, corner_shift: float | None, robust: bool = False) -> tuple[Any, Any]:
+def only_priors(
+    lens: Any, *, corner_shift: float | None, robust_scale: float | None = None
+) -> tuple[Any, Any]:
     """A model of a lens that no photo shows, and the problem of its pseudo-observations."""
     model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
     model.add_camera_with_trivial_rig(lens)
-    pseudo = lens_priors._PseudoObservations(model, config, robust=robust)
+    pseudo = lens_priors._PseudoObservations(model, config, robust_scale)
     if corner_shift is not None:
         pseudo.observe_distortion(model.camera(1), corner_shift)
     else:
@@ -173,31 +176,32 @@ def test_focal_prior_alone_leads_to_its_median(focal: float) -> None:
     assert lens.mean_focal_length() / WIDTH == pytest.approx(1.2, rel=5e-3)
 
 
-@pytest.mark.parametrize("robust", [False, True])
-def test_distortion_prior_has_its_width(robust: bool) -> None:
+@pytest.mark.parametrize("robust_scale", [None, 1.0, 0.5])
+def test_distortion_prior_has_its_width(robust_scale: float | None) -> None:
     """A displacement of the corners by one standard deviation costs as much as a residual of `RESIDUAL`."""
     corner = math.hypot(WIDTH, HEIGHT) / 2 / (1.3 * WIDTH)
     for shift in (-USUAL_SHIFT, USUAL_SHIFT):
-        model, config = only_priors(camera(1.3), corner_shift=USUAL_SHIFT, robust=robust)
+        model, config = only_priors(camera(1.3), corner_shift=USUAL_SHIFT, robust_scale=robust_scale)
         model.camera(1).params = [1.3 * WIDTH, WIDTH / 2, HEIGHT / 2, shift / corner**2]
         config.set_constant_cam_intrinsics(1)
         solve(model, config)
-        assert squared_residuals(model) == pytest.approx(lens_priors.RESIDUAL**2, rel=0.1)
-    model, config = only_priors(camera(1.3), corner_shift=USUAL_SHIFT, robust=robust)
+        residual = lens_priors.RESIDUAL * (robust_scale or 1.0)
+        assert squared_residuals(model) == pytest.approx(residual**2, rel=0.1)
+    model, config = only_priors(camera(1.3), corner_shift=USUAL_SHIFT, robust_scale=robust_scale)
     model.camera(1).params = [1.5 * WIDTH, WIDTH / 2, HEIGHT / 2, 0.0]  # the distance takes the focal length
     config.set_constant_cam_intrinsics(1)
     solve(model, config)
     assert squared_residuals(model) < 1e-3
 
 
-@pytest.mark.parametrize("robust", [False, True])
-def test_priors_hold_lenses_under_either_loss(robust: bool) -> None:
+@pytest.mark.parametrize("robust_scale", [None, 1.0, 0.5])
+def test_priors_hold_lenses_under_either_loss(robust_scale: float | None) -> None:
     """A robust loss takes no prior for a wrong match, even if the lens is far from usual."""
     model = photographed(1.0, spread=0.3, deep=0.02, noise=0.3)
     for lens in model.cameras.values():
         lens.params = [6 * WIDTH, *lens.params[1:]]
     known = {number: LensPrior(1.0 * WIDTH, KNOWN_FOCAL_SPREAD) for number in model.cameras}
-    adjust_with_priors(model, known, corner_shift=None, rounds=8, robust=robust)
+    adjust_with_priors(model, known, corner_shift=None, rounds=8, robust_scale=robust_scale)
     assert np.abs(np.log(focals(model))).max() < 0.2
 
 
@@ -205,5 +209,5 @@ def test_lenses_without_a_prior_are_adjusted() -> None:
     model = photographed(1.0, spread=3.0)
     for lens in model.cameras.values():
         lens.params = [1.1 * WIDTH, *lens.params[1:]]
-    adjust_with_priors(model, {}, corner_shift=USUAL_SHIFT, rounds=8, robust=True)
+    adjust_with_priors(model, {}, corner_shift=USUAL_SHIFT, rounds=8, robust_scale=ROBUST_SCALE)
     assert np.abs(np.log(focals(model))).max() < 0.05

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
+from wildgs.progress import silent
 from wildgs.sfm import incremental, refinement
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.lens_priors import USUAL_SHIFT, LensPrior, adjust_with_priors
@@ -19,10 +21,6 @@ from wildgs.sfm.refinement import CONFIRMED, refine, triangulate, unconfirmed
 from wildgs.sfm.workplace import Workplace
 
 NOISE = 0.3
-
-
-def nothing(done: int, total: int) -> None:
-    """Shows no progress."""
 
 
 def added_wrong_matches(database: Any, model: Any, share: float) -> None:
@@ -37,6 +35,14 @@ def added_wrong_matches(database: Any, model: Any, share: float) -> None:
         geometry.inlier_matches = wrong
         database.delete_two_view_geometry(first, second)
         database.write_two_view_geometry(first, second, geometry)
+
+
+def write_grey_photos(work: Workplace, model: Any) -> None:
+    """Writes photos in which nothing can be aligned."""
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        (work.images / image.name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (image.camera.width, image.camera.height), 128).save(work.images / image.name, "PNG")
 
 
 @pytest.fixture
@@ -54,6 +60,7 @@ def made(tmp_path: Path) -> tuple[Workplace, Any, Any]:
         noisy = pycolmap.Reconstruction(truth)
         pycolmap.synthesize_noise(noise, noisy, database)
         added_wrong_matches(database, truth, 0.2)
+    write_grey_photos(work, noisy)
     random = np.random.default_rng(1)
     for number in noisy.reg_image_ids()[2:]:
         image = noisy.image(number)
@@ -83,7 +90,7 @@ def error(model: Any, truth: Any) -> float:
 
 def refined(made: tuple[Workplace, Any, Any], **options: Any) -> Any:
     work, _, model = made
-    return refine(work, model, len(model.images), SfmConfig(), nothing, {}, **options)
+    return refine(work, model, len(model.images), SfmConfig(), silent, {}, **options)
 
 
 def test_cameras_become_more_exact(made: tuple[Workplace, Any, Any]) -> None:
@@ -128,7 +135,7 @@ def test_cameras_that_explain_much_less_are_refused(
 ) -> None:
     """A scene that becomes deeper until its points cannot be triangulated loses them."""
 
-    def flatten(work: Workplace, model: Any, count: int, constant: Any) -> None:
+    def flatten(work: Workplace, model: Any, count: int, constant: Any, *, scale: float) -> None:
         for number in model.reg_image_ids():
             image = model.image(number)
             pose = pycolmap.Rigid3d(image.cam_from_world().rotation, np.zeros(3))
@@ -175,7 +182,8 @@ def test_two_photos_alone_are_refined(tmp_path: Path) -> None:
     work = Workplace(tmp_path)
     with closing(pycolmap.Database.open(work.database)) as database:
         model = pycolmap.synthesize_dataset(options, database)
-    after = refine(work, model, 2, SfmConfig(), nothing, {})
+    write_grey_photos(work, model)
+    after = refine(work, model, 2, SfmConfig(), silent, {})
     assert after.num_reg_images() == 2
     assert after.num_points3D() > 50
 
@@ -185,10 +193,17 @@ def test_guided_matches_are_found_once(
 ) -> None:
     work, _, model = made
     guided: dict[tuple[int, int], np.ndarray] = {}
-    refine(work, model, len(model.images), SfmConfig(), nothing, guided)
+    refine(work, model, len(model.images), SfmConfig(), silent, guided)
     assert guided
     totals = []
-    refine(work, model, len(model.images), SfmConfig(), lambda done, total: totals.append(total), guided)
+    refine(
+        work,
+        model,
+        len(model.images),
+        SfmConfig(),
+        lambda step, done, total: totals.append(total) if "epipolar" in step else None,
+        guided,
+    )
     assert len(totals) < len(guided)
 
 
@@ -199,6 +214,6 @@ def test_very_many_photos_are_adjusted_without_guided_matches(
     monkeypatch.setattr(incremental, "PRIORS_LIMIT", 5)
     work, truth, model = made
     guided: dict[tuple[int, int], np.ndarray] = {}
-    after = refine(work, model, len(model.images), SfmConfig(), nothing, guided)
+    after = refine(work, model, len(model.images), SfmConfig(), silent, guided)
     assert not guided
     assert error(after, truth) < 0.7 * error(model, truth)

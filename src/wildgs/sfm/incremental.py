@@ -14,7 +14,7 @@ from typing import Any
 import pycolmap
 
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.lens_priors import USUAL_SHIFT, WIDE_SHIFT, LensPrior, adjust_with_priors
+from wildgs.sfm.lens_priors import ROBUST_SCALE, USUAL_SHIFT, WIDE_SHIFT, LensPrior, adjust_with_priors
 from wildgs.sfm.lenses import FOCAL_RANGE, corner_shift
 from wildgs.sfm.lookalikes import keeps_agreement
 from wildgs.sfm.workplace import Workplace
@@ -141,7 +141,9 @@ def measure_distortion(work: Workplace, model: Any, count: int) -> Any:
     return adjusted if keeps_agreement(model, adjusted, work.database) else model
 
 
-def adjust_robustly(work: Workplace, model: Any, count: int, constant: Collection[int] = ()) -> None:
+def adjust_robustly(
+    work: Workplace, model: Any, count: int, constant: Collection[int] = (), *, scale: float = ROBUST_SCALE
+) -> None:
     """Adjusts poses, points and lenses of a finished model with a robust loss, and filters its observations.
 
     Args:
@@ -149,10 +151,11 @@ def adjust_robustly(work: Workplace, model: Any, count: int, constant: Collectio
         model: The model; modified.
         count: Number of all photos.
         constant: Ids of cameras whose lenses stay as they are.
+        scale: Error from which the loss grows more slowly than the squared one, pixels.
     """
     priors = _priors(work) if count <= PRIORS_LIMIT else {}
     spread = WIDE_SHIFT if is_wide(model) else USUAL_SHIFT
-    _finish(model, priors, spread, constant, robust=True)
+    _finish(model, priors, spread, constant, robust_scale=scale)
 
 
 def is_wide(model: Any) -> bool:
@@ -178,10 +181,10 @@ def _finish(
     spread: float | None,
     constant: Collection[int] = (),
     *,
-    robust: bool = False,
+    robust_scale: float | None = None,
 ) -> None:
     adjust_with_priors(
-        model, priors, corner_shift=spread, constant=constant, rounds=LAST_ROUNDS, robust=robust
+        model, priors, corner_shift=spread, constant=constant, rounds=LAST_ROUNDS, robust_scale=robust_scale
     )
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
 

@@ -26,8 +26,9 @@ import numpy as np
 import pycolmap
 
 RESIDUAL = 2.0
-"""Standard deviation of an observation's residual, pixels, against which the priors are weighed. Residuals are less
-than half of that, but those of neighbouring features are not independent."""
+"""Standard deviation of an observation's residual against which the priors are weighed, relative to the scale of
+the robust loss, or in pixels under the squared one. Residuals are less than half of that, but those of neighbouring
+features are not independent."""
 
 USUAL_FOCAL, FOCAL_SPREAD = 1.2, 0.75
 """Median of the prior of a focal length, relative to the longer side (COLMAP's initial value), and the standard
@@ -51,8 +52,8 @@ ROBUST_SCALE = 1.0
 
 SMALL_RESIDUAL, MOST_COPIES, RING_COPIES = 0.4, 100, 4
 """With a robust loss, which would take a large residual of a pseudo-observation for a wrong match: that of a focal
-length is divided among as many observations as make it smaller than the first number, in pixels, but not more than
-the second; the third is the number of observations of each point of the rings."""
+length is divided among as many observations as make it smaller than the first number, relative to the loss's scale,
+but not more than the second; the third is the number of observations of each point of the rings at a scale of 1."""
 
 LEAST_COPIES = 2
 """Number of observations of a point that COLMAP's bundle adjustment needs."""
@@ -89,7 +90,7 @@ def adjust_with_priors(
     corner_shift: float | None,
     constant: Collection[int] = (),
     rounds: int = ROUNDS,
-    robust: bool = False,
+    robust_scale: float | None = None,
 ) -> None:
     """Adjusts poses, points and lenses of a model in place.
 
@@ -100,14 +101,15 @@ def adjust_with_priors(
             their distance from the centre. None keeps distortion as it is.
         constant: Ids of cameras whose lenses stay as they are.
         rounds: Upper bound on the number of bundle adjustments.
-        robust: Whether the loss is that of Cauchy instead of the squared error.
+        robust_scale: Error from which the loss, that of Cauchy, grows more slowly than the squared one, pixels.
+            None for the squared error.
     """
     photos = list(model.reg_image_ids())
     lenses = sorted({model.image(photo).camera_id for photo in photos} - set(constant))
     trial = pycolmap.Reconstruction(model)
     for _ in range(rounds):
         before = {lens: trial.camera(lens).mean_focal_length() for lens in lenses}
-        if not _adjust(trial, photos, lenses, priors, constant, corner_shift, robust):
+        if not _adjust(trial, photos, lenses, priors, constant, corner_shift, robust_scale):
             return
         changes = [abs(math.log(trial.camera(lens).mean_focal_length() / before[lens])) for lens in lenses]
         if max(changes, default=0.0) < CONVERGED:
@@ -122,7 +124,7 @@ def _adjust(
     priors: Mapping[int, LensPrior],
     constant: Collection[int],
     corner_shift: float | None,
-    robust: bool,
+    robust_scale: float | None,
 ) -> bool:
     """One bundle adjustment with pseudo-observations; returns whether its solution is usable."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -130,7 +132,7 @@ def _adjust(
         config.add_image(photo)
     for lens in constant:
         config.set_constant_cam_intrinsics(lens)
-    pseudo = _PseudoObservations(trial, config, robust=robust)
+    pseudo = _PseudoObservations(trial, config, robust_scale)
     for lens in lenses:
         camera = trial.camera(lens)
         if lens not in priors:
@@ -143,9 +145,9 @@ def _adjust(
     options.print_summary = False
     options.refine_extra_params = corner_shift is not None
     options.ceres.solver_options.max_num_iterations = ITERATIONS
-    if robust:
+    if robust_scale is not None:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = ROBUST_SCALE
+        options.ceres.loss_function_scale = robust_scale
     summary = pycolmap.create_default_bundle_adjuster(options, config, trial).solve()
     pseudo.remove()
     lengths = [trial.camera(lens).mean_focal_length() for lens in lenses]
@@ -155,8 +157,9 @@ def _adjust(
 class _PseudoObservations:
     """Images that do not exist and their points, in a copy of a model."""
 
-    def __init__(self, trial: Any, config: Any, *, robust: bool = False) -> None:
-        self._trial, self._config, self._robust = trial, config, robust
+    def __init__(self, trial: Any, config: Any, robust_scale: float | None = None) -> None:
+        self._trial, self._config, self._robust = trial, config, robust_scale is not None
+        self._residual = RESIDUAL * (ROBUST_SCALE if robust_scale is None else robust_scale)
         self._points: list[int] = []
         self._frames: list[int] = []
 
@@ -167,7 +170,7 @@ class _PseudoObservations:
         target = focal * (1 - deviation * prior.spread)
         many = math.ceil((RESIDUAL * deviation / SMALL_RESIDUAL) ** 2) if self._robust else LEAST_COPIES
         copies = min(max(LEAST_COPIES, many), MOST_COPIES)
-        points = np.array([[RESIDUAL / (prior.spread * focal) / math.sqrt(copies), 0.0]])
+        points = np.array([[self._residual / (prior.spread * focal) / math.sqrt(copies), 0.0]])
         self._add(camera, points, points * target, copies=copies, constant=True)
 
     def observe_distortion(self, camera: Any, corner_shift: float) -> None:
@@ -175,11 +178,11 @@ class _PseudoObservations:
         diagonal = math.hypot(camera.width, camera.height) / 2
         focal = camera.mean_focal_length()
         # Information about the coefficient in N points of two rings of radius a and INNER a, after the distance
-        # from their plane is eliminated: N f^2 a^6 times this number. It should be (RESIDUAL / its deviation)^2.
+        # from their plane is eliminated: N f^2 a^6 times this number. It should be (residual / its deviation)^2.
         left = 1 + INNER**6 - (1 + INNER**4) ** 2 / (1 + INNER**2)
         copies = RING_COPIES if self._robust else LEAST_COPIES
         number = copies * len(RING)
-        outer = (RESIDUAL**2 / (corner_shift**2 * left * number * diagonal**2)) ** (1 / 6)
+        outer = (self._residual**2 / (corner_shift**2 * left * number * diagonal**2)) ** (1 / 6)
         radius = outer * diagonal / focal
         points = radius * np.concatenate([RING, INNER * RING])
         self._add(camera, points, points * focal, copies=copies, constant=False)

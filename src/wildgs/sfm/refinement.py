@@ -1,6 +1,6 @@
-"""The last adjustment of cameras: with more matches, without those that two photos alone show, and a robust loss.
+"""The last adjustments of cameras: with more matches, without points of two photos, a robust loss, exact features.
 
-Incremental mapping ends with cameras that are less exact than the photos allow, for three reasons:
+Incremental mapping ends with cameras that are less exact than the photos allow, for four reasons:
 
 - Points of two photos are rarely right. COLMAP makes them of features that further photos matched but do not
   confirm, and nothing but the epipolar line speaks against a wrong match. Here, they do not move cameras.
@@ -9,6 +9,8 @@ Incremental mapping ends with cameras that are less exact than the photos allow,
   Triggs et al., "Bundle adjustment: a modern synthesis", Vision Algorithms 1999.
 - Lowe's test rejects most right matches of repeated architecture. Once cameras are known, photos are matched again
   along epipolar lines (`wildgs.sfm.guided_matching`).
+- Features are where a detector finds them, half a pixel from where photos show the same. Once points are known,
+  their features are moved there (`wildgs.sfm.keypoint_refinement`), and those that cannot be do not move cameras.
 """
 
 from __future__ import annotations
@@ -22,9 +24,12 @@ import numpy as np
 import pycolmap
 
 from wildgs.progress import Counter as Progressed
+from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.guided_matching import GuidedMatches, Matches, match_guided, neighbours
 from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
+from wildgs.sfm.keypoint_refinement import Observation, refine_keypoints
+from wildgs.sfm.lens_priors import ROBUST_SCALE
 from wildgs.sfm.lookalikes import verified_matches
 from wildgs.sfm.workplace import Workplace
 
@@ -44,8 +49,14 @@ CONFIRMED = 3
 LEAST_CONFIRMED = 20
 """Number of observations of confirmed points below which a photo needs its other points as well."""
 
+MOST_ALIGNED = 0.5
+"""Share of a photo's observations from which those that are aligned determine its camera alone."""
+
+EXACT_SCALE = 0.5
+"""Error from which the robust loss grows more slowly once features are moved, pixels."""
+
 LEAST_KEPT = 0.9
-"""Share of the observations from verified matches that adjusted cameras have to explain. A scene may become deeper
+"""Share of the observations that adjusted cameras have to explain. A scene may become deeper
 until its points are too far away to be triangulated."""
 
 
@@ -54,18 +65,18 @@ def refine(
     model: Any,
     count: int,
     config: SfmConfig,
-    progress: Progressed,
+    progress: Progress,
     guided: GuidedMatches,
     constant: Collection[int] = (),
 ) -> Any:
-    """Matches the photos of a finished model again, triangulates its points anew and adjusts everything.
+    """Matches the photos of a finished model again, moves features, and triangulates and adjusts everything anew.
 
     Args:
         work: The workplace; its database contains features and verified matches.
         model: The model; not modified.
         count: Number of all photos.
         config: Options.
-        progress: Called with (pairs matched again, total number of pairs).
+        progress: Called during matching and moving.
         guided: Guided matches of earlier calls, which are not found again; receives those of this one.
         constant: Ids of cameras whose lenses stay as they are.
 
@@ -77,26 +88,37 @@ def refine(
     first = _adjusted(work, known, known, verified, count, config, constant)
     if first is None:
         return known
-    matches = with_guided_matches(work, first, verified, guided, progress)
+    show = counter(progress, "matching along epipolar lines")
+    matches = with_guided_matches(work, first, verified, guided, show)
     second = _adjusted(work, triangulate(first, matches, config), first, verified, count, config, constant)
-    return triangulate(first if second is None else second, matches, config)
+    rough = triangulate(first if second is None else second, matches, config)
+    moved, aligned = refine_keypoints(work, rough, counter(progress, "aligning features"))
+    _keep_alone(moved, aligned)
+    third = (
+        _adjusted(work, moved, rough, matches, count, config, constant, scale=EXACT_SCALE)
+        if aligned
+        else None
+    )
+    return rough if third is None else third
 
 
 def _adjusted(
     work: Workplace,
     model: Any,
     before: Any,
-    verified: Matches,
+    matches: Matches,
     count: int,
     config: SfmConfig,
     constant: Collection[int],
+    *,
+    scale: float = ROBUST_SCALE,
 ) -> Any | None:
-    """The model with adjusted cameras and points from verified matches; None if these are far fewer."""
+    """The model with adjusted cameras and new points from matches; None if these are far fewer than before."""
     adjusted = pycolmap.Reconstruction(model)
     for point in unconfirmed(adjusted):
         adjusted.delete_point3D(point)
-    adjust_robustly(work, adjusted, count, constant)
-    after = triangulate(adjusted, verified, config)
+    adjust_robustly(work, adjusted, count, constant, scale=scale)
+    after = triangulate(adjusted, matches, config)
     kept = after.compute_num_observations() >= LEAST_KEPT * before.compute_num_observations()
     return after if kept else None
 
@@ -150,6 +172,25 @@ def triangulate(model: Any, matches: Matches, config: SfmConfig) -> Any:
     triangulator.merge_all_tracks(options)
     observations.filter_all_points3D(MAX_ERROR, MIN_ANGLE)
     return copy
+
+
+def _keep_alone(model: Any, aligned: Collection[Observation]) -> None:
+    """Deletes the other observations of points of three photos or more, of photos of which most are aligned."""
+    points = {
+        point: [(e.image_id, e.point2D_idx) for e in model.point3D(point).track.elements]
+        for point in model.point3D_ids()
+        if model.point3D(point).track.length() >= CONFIRMED
+    }
+    total = Counter(photo for elements in points.values() for photo, _ in elements)
+    found = Counter(photo for photo, _ in aligned)
+    exact = {photo for photo in total if found[photo] >= MOST_ALIGNED * total[photo]}
+    for point, elements in points.items():
+        others = [element for element in elements if element[0] in exact and element not in aligned]
+        if len(elements) - len(others) < 2:
+            model.delete_point3D(point)
+            continue
+        for photo, feature in others:
+            model.delete_observation(photo, feature)
 
 
 def unconfirmed(model: Any) -> list[int]:

@@ -79,6 +79,7 @@ class Registration:
             All models, and the pairs that were matched again.
         """
         if models:
+            drop_unsure(models[0], self.work, self.passes)
             models = [self._place_by_points(models[0], "second"), *models[1:]]
             if not self.missing(models[0]):
                 return models[:1], set()
@@ -104,6 +105,8 @@ class Registration:
     def refine(self, model: Any) -> Any:
         """The refined model, with photos that only its points, of which there are more, give a pose."""
         refined = self._refined(model)
+        if self.config.second_chance:
+            drop_unsure(refined, self.work, self.passes)
         if not self.config.second_chance or not self.missing(refined):
             return refined
         grown = self._place_by_points(refined, "second")
@@ -190,8 +193,9 @@ class Registration:
         return after
 
     def _refined(self, model: Any, constant: Collection[int] = ()) -> Any:
-        show = counter(self.progress, "matching along epipolar lines")
-        refined = refine(self.work, model, len(self.copies), self.config, show, self.guided, constant)
+        refined = refine(
+            self.work, model, len(self.copies), self.config, self.progress, self.guided, constant
+        )
         return refined if keeps_agreement(model, refined, self.work.database) else model
 
     def _more_pairs(self, models: Sequence[Any]) -> set[Pair]:
@@ -225,15 +229,19 @@ def names_of(model: Any) -> set[str]:
 
 
 def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> None:
-    """Removes photos registered by a later pass whose poses are not reliable.
+    """Removes photos whose poses are not reliable.
 
-    They have too few points, are contradicted by most of their matches, or share few points with every other photo.
-    Repeated architecture, like the sides of an octagonal tower, gives points scattered over many photos.
+    Those registered by a later pass have too few points, are contradicted by most of their matches, or share few
+    points with every other photo; of the first pass, both. Repeated architecture, like the sides of an octagonal
+    tower, gives points scattered over many photos.
     """
     doubtful = find_doubtful(model, work.database, {name: name for name in names_of(model)})
     for image_id in list(model.reg_image_ids()):
         image = model.image(image_id)
-        if image.name not in passes:
-            continue
-        if image.name in doubtful or image.num_points3D < LEAST_POINTS or not count_neighbours(model, image):
+        contradicted, alone = image.name in doubtful, not count_neighbours(model, image)
+        if image.name in passes:
+            unsure = contradicted or alone or image.num_points3D < LEAST_POINTS
+        else:
+            unsure = contradicted and alone
+        if unsure:
             model.deregister_frame(image.frame_id)
