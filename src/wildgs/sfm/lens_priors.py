@@ -25,6 +25,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from wildgs.sfm.lenses import stretched_lenses
+
 RESIDUAL = 2.0
 """Standard deviation of an observation's residual against which the priors are weighed, relative to the scale of
 the robust loss, or in pixels under the squared one. Residuals are less than half of that, but those of neighbouring
@@ -99,12 +101,13 @@ def adjust_with_priors(
         priors: Priors by camera id; lenses without one have none.
         corner_shift: Prior standard deviation of the displacement of a photo's corners by distortion, relative to
             their distance from the centre. None keeps distortion as it is.
-        constant: Ids of cameras whose lenses stay as they are.
+        constant: Ids of cameras whose lenses stay as they are, like those of stretched photos.
         rounds: Upper bound on the number of bundle adjustments.
         robust_scale: Error from which the loss, that of Cauchy, grows more slowly than the squared one, pixels.
             None for the squared error.
     """
     photos = list(model.reg_image_ids())
+    constant = {*constant, *stretched_lenses(model)}
     lenses = sorted({model.image(photo).camera_id for photo in photos} - set(constant))
     trial = pycolmap.Reconstruction(model)
     for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""Detects implausible lenses: stitched panoramas, little planets, and wrong poses."""
+"""Which lenses are implausible (stitched panoramas, little planets, wrong poses), and which photos stretched."""
 
 from __future__ import annotations
 
@@ -17,6 +17,14 @@ MAX_ERROR = 0.008
 """Largest reprojection error of an inlier without distortion, relative to the longer side."""
 LEAST_POINTS, LEAST_SHARE = 15, 0.6
 """Smallest number and fraction of inliers among a photo's points."""
+
+
+def stretched_lenses(model: Any) -> set[int]:
+    """Ids of the cameras of stretched photos, which only `wildgs.sfm.edited_photos` fits.
+
+    Bundle adjustment would free distortion coefficients of theirs that are 0.
+    """
+    return {number for number, camera in model.cameras.items() if camera.model_name == "OPENCV"}
 
 
 def lens_fault(camera: Any) -> str | None:

@@ -14,6 +14,7 @@ from wildgs.progress import Progress
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.incremental import is_wide, pipeline_options, run_pipeline
 from wildgs.sfm.initial_pairs import LEAST_ANGLE, LEAST_MATCHES, initial_pairs
+from wildgs.sfm.lenses import stretched_lenses
 from wildgs.sfm.lookalikes import count_agreeing, keeps_agreement
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -210,7 +211,7 @@ def continue_mapping(
     model.write(start)
     options = pipeline_options(config)
     _expect_few_inliers(options)
-    constant = lenses_of(work, constant_lenses)
+    constant = lenses_of(work, constant_lenses) | stretched_lenses(model)
     options.constant_cameras = options.mapper.constant_cameras = constant
     options.multiple_models = False
     next_photo = _counted(progress, model.num_reg_images(), count)

@@ -1,6 +1,6 @@
 """The last adjustments of cameras: with more matches, without points of two photos, a robust loss, exact features.
 
-Incremental mapping ends with cameras that are less exact than the photos allow, for four reasons:
+Incremental mapping ends with cameras that are less exact than the photos allow, for five reasons:
 
 - Points of two photos are rarely right. COLMAP makes them of features that further photos matched but do not
   confirm, and nothing but the epipolar line speaks against a wrong match. Here, they do not move cameras.
@@ -11,6 +11,8 @@ Incremental mapping ends with cameras that are less exact than the photos allow,
   along epipolar lines (`wildgs.sfm.guided_matching`).
 - Features are where a detector finds them, half a pixel from where photos show the same. Once points are known,
   their features are moved there (`wildgs.sfm.keypoint_refinement`), and those that cannot be do not move cameras.
+- Photos are cropped and stretched. Their principal points and aspect ratios are fitted last
+  (`wildgs.sfm.edited_photos`).
 """
 
 from __future__ import annotations
@@ -26,11 +28,12 @@ import pycolmap
 from wildgs.progress import Counter as Progressed
 from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.edited_photos import fit_edited
 from wildgs.sfm.guided_matching import GuidedMatches, Matches, match_guided, neighbours
 from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
 from wildgs.sfm.keypoint_refinement import Observation, refine_keypoints
 from wildgs.sfm.lens_priors import ROBUST_SCALE
-from wildgs.sfm.lookalikes import verified_matches
+from wildgs.sfm.lookalikes import keeps_agreement, verified_matches
 from wildgs.sfm.workplace import Workplace
 
 REACH = 0.003
@@ -51,6 +54,9 @@ LEAST_CONFIRMED = 20
 
 MOST_ALIGNED = 0.5
 """Share of a photo's observations from which those that are aligned determine its camera alone."""
+
+TURNS = 3
+"""Number of times that cropped photos are fitted and everything is adjusted, in turns."""
 
 EXACT_SCALE = 0.5
 """Error from which the robust loss grows more slowly once features are moved, pixels."""
@@ -93,13 +99,29 @@ def refine(
     second = _adjusted(work, triangulate(first, matches, config), first, verified, count, config, constant)
     rough = triangulate(first if second is None else second, matches, config)
     moved, aligned = refine_keypoints(work, rough, counter(progress, "aligning features"))
+    if not aligned:
+        return rough
     _keep_alone(moved, aligned)
-    third = (
-        _adjusted(work, moved, rough, matches, count, config, constant, scale=EXACT_SCALE)
-        if aligned
-        else None
-    )
-    return rough if third is None else third
+    exact = _adjusted(work, moved, rough, matches, count, config, constant, scale=EXACT_SCALE)
+    if exact is None:
+        return rough
+    return _with_edited_photos(work, exact, matches, count, config, constant)
+
+
+def _with_edited_photos(
+    work: Workplace, model: Any, matches: Matches, count: int, config: SfmConfig, constant: Collection[int]
+) -> Any:
+    """The model with principal points and aspect ratios, fitted in turns with the adjustment of everything else."""
+    best = model
+    for _ in range(TURNS):
+        fitted = pycolmap.Reconstruction(best)
+        if not fit_edited(fitted, EXACT_SCALE, constant):
+            break
+        after = _adjusted(work, fitted, best, matches, count, config, constant, scale=EXACT_SCALE)
+        if after is None or not keeps_agreement(best, after, work.database):
+            break
+        best = after
+    return best
 
 
 def _adjusted(

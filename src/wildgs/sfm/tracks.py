@@ -127,7 +127,7 @@ def rows_by_photo(photos: Int64[np.ndarray, " O"]) -> Iterator[tuple[int, Int64[
     """Each photo's image id and the rows of its observations."""
     order = np.argsort(photos, kind="stable")
     ids, starts = np.unique(photos[order], return_index=True)
-    for photo, start, end in zip(ids, starts, np.append(starts[1:], len(order)), strict=True):
+    for photo, start, end in zip(ids, starts, np.append(starts, len(order))[1:], strict=True):
         yield int(photo), order[start:end]
 
 
