@@ -85,7 +85,7 @@ def glb_bytes(scene: RelightableScene, harmonics: SharedHarmonics) -> bytes:
         primitive = {"attributes": geometry | colors, "mode": 0, "extensions": {EXTENSION: extension}}
         name = printable(light.name)
         meshes.append({"name": name, "primitives": [primitive]})
-        nodes += [{"name": name, "mesh": number}, _camera_node(scene.start)]
+        nodes += [{"name": name, "mesh": number}, _camera_node(scene.start.centered())]
         extras = {
             "photo": name,
             "captured": light.captured,
@@ -167,7 +167,7 @@ def _add_rest(
 
 
 def _camera(scene: RelightableScene) -> dict[str, Any]:
-    camera = scene.start
+    camera = scene.start.centered()
     lens = {
         "yfov": float(2 * torch.atan(0.5 * camera.height / camera.K[1, 1])),
         "aspectRatio": float(camera.width / camera.height * camera.K[1, 1] / camera.K[0, 0]),

@@ -150,7 +150,7 @@ def script_json(value: Any) -> str:
 
 
 def _start(view: PageView) -> dict[str, Any]:
-    camera = view.camera
+    camera = view.camera.centered()
     target = camera.position + view.depth * camera.forward
     return {
         "position": camera.position.tolist(),

@@ -59,6 +59,30 @@ class Camera:
         K[1, 2] -= top
         return replace(self, K=K, width=width, height=height)
 
+    def centered(self) -> Camera:
+        """The camera at the same place that looks through the centre of the image, its principal point.
+
+        For programs that know no other principal point: photos are cropped, and theirs may be anywhere.
+        """
+        center = torch.tensor([self.width / 2, self.height / 2]).to(self.K)
+        ahead = torch.cat(
+            [(center - self.K[:2, 2]) / torch.stack([self.K[0, 0], self.K[1, 1]]), center.new_ones(1)]
+        )
+        ahead = torch.nn.functional.normalize(ahead, dim=0)
+        # The smallest rotation of this direction to the z axis.
+        x, y, z = ahead
+        turn = torch.stack(
+            [
+                torch.stack([1 - x * x / (1 + z), -x * y / (1 + z), -x]),
+                torch.stack([-x * y / (1 + z), 1 - y * y / (1 + z), -y]),
+                ahead,
+            ]
+        )
+        viewmat, K = self.viewmat.clone(), self.K.clone()
+        viewmat[:3] = turn.to(viewmat) @ viewmat[:3]
+        K[:2, 2] = center
+        return replace(self, viewmat=viewmat, K=K)
+
     def project(self, points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
         """Pixels (x, y) of world points, undefined where the depth is not positive, and depths along z."""
         seen = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]

@@ -33,6 +33,7 @@ class Pose:
 
 def pose_of(camera: Camera) -> Pose:
     """Converts a camera to viser's, whose principal point is always the centre of the image."""
+    camera = camera.centered()
     rotation = camera.viewmat[:3, :3].T.double().cpu().numpy()
     xyzw = Rotation.from_matrix(rotation).as_quat()
     return Pose(
