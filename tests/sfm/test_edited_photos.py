@@ -15,8 +15,8 @@ from tests.sfm.test_refinement import write_grey_photos
 from wildgs.progress import silent
 from wildgs.sfm import edited_photos, refinement
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.edited_photos import LEAST_OBSERVATIONS, fit_edited
-from wildgs.sfm.lenses import stretched_lenses
+from wildgs.sfm.edited_photos import LEAST_OBSERVATIONS, fit_edited, with_square_pixels
+from wildgs.sfm.lenses import lens_fault, stretched_lenses
 from wildgs.sfm.refinement import refine
 from wildgs.sfm.workplace import Workplace
 
@@ -104,6 +104,31 @@ def test_a_stretched_photo_is_fitted_again_and_may_turn_out_not_to_be(made: tupl
     square.params = [FOCAL, 1.02 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.0, 0.0, 0.0, 0.0]
     fit_edited(model, 0.5)
     assert lens(model, 0).model_name == "SIMPLE_RADIAL"
+
+
+def test_mapping_continues_with_square_pixels(made: tuple[Workplace, Any]) -> None:
+    _, model = made
+    fit_edited(model, 0.5)
+    stretched = lens(model, STRETCHED)
+    square = with_square_pixels(model, 1.0)
+    assert stretched.model_name == "OPENCV", "the model is not modified"
+    assert stretched_lenses(square) == set()
+    assert error(model, STRETCHED) < error(square, STRETCHED) < 30
+    assert list(lens(square, CROPPED).params) == list(lens(model, CROPPED).params)
+    image = model.image(sorted(model.reg_image_ids())[STRETCHED])
+    model.deregister_frame(image.frame_id)
+    alone = with_square_pixels(model, 1.0).camera(image.camera_id)
+    assert alone.model_name == "SIMPLE_RADIAL"
+    assert list(alone.params) == [stretched.params[0], *stretched.params[2:5]]
+
+
+def test_stretched_lenses_can_be_implausible(made: tuple[Workplace, Any]) -> None:
+    _, model = made
+    fit_edited(model, 0.5)
+    camera = lens(model, STRETCHED)
+    assert lens_fault(camera) is None
+    camera.params = [*camera.params[:4], 9.0, 0.0, 0.0, 0.0]
+    assert "distortion" in str(lens_fault(camera))
 
 
 def test_constant_lenses_and_photos_with_few_points_stay(

@@ -74,6 +74,30 @@ def fit_edited(model: Any, scale: float, constant: Collection[int] = ()) -> int:
     return fitted
 
 
+def with_square_pixels(model: Any, scale: float) -> Any:
+    """A copy of a model in which stretched photos have the SIMPLE_RADIAL cameras that fit its points best.
+
+    Mapping knows no others: it may reset a lens to that of the database.
+
+    Args:
+        model: pycolmap's reconstruction.
+        scale: Scale of the robust loss, pixels.
+    """
+    square = pycolmap.Reconstruction(model)
+    for photo in square.reg_image_ids():
+        image: Any = square.image(photo)
+        if image.camera.model_name == "OPENCV":
+            problem = _Problem.of(image, *_observed(square, image), scale)
+            if not len(problem.pixels) or not problem.apply(problem.solve(np.zeros(PARAMETERS - 1)).x, image):
+                problem.apply(np.zeros(PARAMETERS - 1), image)
+    for camera in square.cameras.values():
+        if camera.model_name == "OPENCV":  # of photos without a pose
+            lens = _lens(camera)
+            camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+            camera.params = [float(value) for value in lens[:4]]
+    return square
+
+
 def _fit(model: Any, image: Any, scale: float) -> bool:
     pixels, points = _observed(model, image)
     if len(pixels) < LEAST_OBSERVATIONS:
@@ -131,18 +155,18 @@ class _Problem:
         """The problem of an image that observes points at pixels."""
         camera, pose = image.camera, image.cam_from_world()
         inside = pose * points
-        middle = inside.mean(axis=0)
+        middle = inside.mean(axis=0) if len(inside) else np.array([0.0, 0.0, 1.0])
         slopes = inside[:, :2] / np.maximum(inside[:, 2:], 1e-9)
         return cls(
             pixels,
             inside - middle,
             middle,
             pose.rotation,
-            points.mean(axis=0),
+            pose.inverse() * middle,
             _lens(camera),
             np.array([camera.width, camera.height]) / 2,
             float(max(camera.width, camera.height)),
-            float(max((slopes**2).sum(axis=1).max(), 1e-9)),
+            float((slopes**2).sum(axis=1).max(initial=1e-9)),
             scale,
         )
 

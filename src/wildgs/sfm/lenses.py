@@ -31,7 +31,7 @@ def lens_fault(camera: Any) -> str | None:
     """The reason why a camera is implausible, or None.
 
     Args:
-        camera: pycolmap's camera; distortion is checked for SIMPLE_RADIAL only.
+        camera: pycolmap's camera, SIMPLE_RADIAL or OPENCV.
     """
     focal = camera.mean_focal_length() / max(camera.width, camera.height)
     if not FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1]:
@@ -49,11 +49,14 @@ def corner_shift(camera: Any) -> float:
     """Displacement of a photo's corners by distortion, relative to their distance from the centre.
 
     Args:
-        camera: pycolmap's camera; 0 for models other than SIMPLE_RADIAL.
+        camera: pycolmap's camera; 0 for models other than SIMPLE_RADIAL and that of stretched photos, OPENCV.
     """
-    if camera.model_name != "SIMPLE_RADIAL":
+    if camera.model_name not in ("SIMPLE_RADIAL", "OPENCV"):
         return 0.0
-    focal, _, _, radial = camera.params
+    focal, radial = (
+        camera.mean_focal_length(),
+        camera.params[3 if camera.model_name == "SIMPLE_RADIAL" else 4],
+    )
     return float(radial * (np.hypot(camera.width, camera.height) / 2 / focal) ** 2)
 
 

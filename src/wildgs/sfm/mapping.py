@@ -12,9 +12,10 @@ import pycolmap
 
 from wildgs.progress import Progress
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.edited_photos import with_square_pixels
 from wildgs.sfm.incremental import is_wide, pipeline_options, run_pipeline
 from wildgs.sfm.initial_pairs import LEAST_ANGLE, LEAST_MATCHES, initial_pairs
-from wildgs.sfm.lenses import stretched_lenses
+from wildgs.sfm.lens_priors import ROBUST_SCALE
 from wildgs.sfm.lookalikes import count_agreeing, keeps_agreement
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -207,17 +208,17 @@ def continue_mapping(
     Returns:
         The larger model, or `model` if no photo could be registered or most matches contradict it afterwards.
     """
-    start = work.fresh("start")
-    model.write(start)
+    start, square = work.fresh("start"), with_square_pixels(model, ROBUST_SCALE)
+    square.write(start)
     options = pipeline_options(config)
     _expect_few_inliers(options)
-    constant = lenses_of(work, constant_lenses) | stretched_lenses(model)
+    constant = lenses_of(work, constant_lenses)
     options.constant_cameras = options.mapper.constant_cameras = constant
     options.multiple_models = False
     next_photo = _counted(progress, model.num_reg_images(), count)
     models = run_pipeline(work, options, count, next_photo, start, constant, wide=is_wide(model))
     grown = bool(models) and models[0].num_reg_images() > model.num_reg_images()
-    return models[0] if grown and keeps_agreement(model, models[0], work.database) else model
+    return models[0] if grown and keeps_agreement(square, models[0], work.database) else model
 
 
 def _expect_few_inliers(options: Any) -> None:

@@ -62,8 +62,8 @@ EXACT_SCALE = 0.5
 """Error from which the robust loss grows more slowly once features are moved, pixels."""
 
 LEAST_KEPT = 0.9
-"""Share of the observations that adjusted cameras have to explain. A scene may become deeper
-until its points are too far away to be triangulated."""
+"""Share of the observations that adjusted cameras have to explain. A scene may become deeper until its points are
+too far away to be triangulated."""
 
 
 def refine(
@@ -111,9 +111,12 @@ def refine(
 def _with_edited_photos(
     work: Workplace, model: Any, matches: Matches, count: int, config: SfmConfig, constant: Collection[int]
 ) -> Any:
-    """The model with principal points and aspect ratios, fitted in turns with the adjustment of everything else."""
+    """The model with principal points and aspect ratios, fitted in turns with the adjustment of everything else.
+
+    Of very many photos, whose adjustment takes long, once.
+    """
     best = model
-    for _ in range(TURNS):
+    for _ in range(TURNS if model.num_reg_images() <= GUIDED_LIMIT else 1):
         fitted = pycolmap.Reconstruction(best)
         if not fit_edited(fitted, EXACT_SCALE, constant):
             break
