@@ -32,7 +32,8 @@ ASPECT_SPREAD = 0.005
 """Scale of the prior of the logarithm of the aspect ratio of pixels."""
 
 LEAST_GAIN = 5.0
-"""Smallest gain in logarithm of the posterior probability from which a photo is taken for a stretched one."""
+"""Smallest gain in logarithm of the posterior probability from which a photo is taken for cropped or stretched. Else
+its principal point is the centre, and its pixels are square."""
 
 LEAST_OBSERVATIONS = 40
 """Smallest number of observations of points that others confirm, from which a photo's camera is fitted."""
@@ -43,10 +44,10 @@ CONFIRMED = 3
 EVALUATIONS = 60
 """Upper bound on evaluations of the residuals of a photo, without those for derivatives."""
 
-PARAMETERS = 11
-"""Rotation about the middle of the points (a rotation vector), translation relative to their distance, logarithm of
-the focal length, distortion of the outermost point, principal point relative to the longer side, and logarithm of
-the aspect ratio."""
+WHOLE, CROPPED, STRETCHED = 8, 10, 11
+"""Numbers of parameters of a photo: rotation about the middle of the points (a rotation vector), translation relative
+to their distance, logarithm of the focal length, distortion of the outermost point; displacement of the principal
+point from the centre relative to the longer side; and logarithm of the aspect ratio."""
 
 MOST = 2.0
 """Largest change of a logarithm, beyond which least squares may look for a solution but does not find one."""
@@ -88,8 +89,9 @@ def with_square_pixels(model: Any, scale: float) -> Any:
         image: Any = square.image(photo)
         if image.camera.model_name == "OPENCV":
             problem = _Problem.of(image, *_observed(square, image), scale)
-            if not len(problem.pixels) or not problem.apply(problem.solve(np.zeros(PARAMETERS - 1)).x, image):
-                problem.apply(np.zeros(PARAMETERS - 1), image)
+            start = problem.start(CROPPED)
+            if not len(problem.pixels) or not problem.apply(problem.solve(start).x, image):
+                problem.apply(start, image)
     for camera in square.cameras.values():
         if camera.model_name == "OPENCV":  # of photos without a pose
             lens = _lens(camera)
@@ -103,10 +105,12 @@ def _fit(model: Any, image: Any, scale: float) -> bool:
     if len(pixels) < LEAST_OBSERVATIONS:
         return False
     problem = _Problem.of(image, pixels, points, scale)
-    plain = problem.solve(np.zeros(PARAMETERS - 1))
-    stretched = problem.solve(np.append(plain.x, problem.lens[4]))
-    gain = (plain.cost - stretched.cost) / (RESIDUAL * scale) ** 2
-    return problem.apply((stretched if gain > LEAST_GAIN else plain).x, image)
+    best = problem.solve(problem.start(WHOLE))
+    for parameters in (CROPPED, STRETCHED):
+        trial = problem.solve(problem.start(parameters))
+        if best.cost - trial.cost > LEAST_GAIN * (RESIDUAL * scale) ** 2:
+            best = trial
+    return problem.apply(best.x, image)
 
 
 def _observed(model: Any, image: Any) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, "N 3"]]:
@@ -122,7 +126,7 @@ def _observed(model: Any, image: Any) -> tuple[Float64[np.ndarray, "N 2"], Float
 
 @dataclass(frozen=True)
 class _Problem:
-    """Residuals of a photo by changes of its camera (`PARAMETERS`); without the last one, pixels are square.
+    """Residuals of a photo by changes of its camera, of which there are `WHOLE`, `CROPPED` or `STRETCHED`.
 
     Attributes:
         pixels: Where the photo shows the points.
@@ -170,8 +174,15 @@ class _Problem:
             scale,
         )
 
+    def start(self, parameters: int) -> Float64[np.ndarray, " C"]:
+        """The changes of the present camera, as far as there are parameters."""
+        changes = np.zeros(STRETCHED)
+        changes[WHOLE:CROPPED] = (self.lens[1:3] - self.center) / self.side
+        changes[CROPPED] = self.lens[4]
+        return changes[:parameters]
+
     def solve(self, start: Float64[np.ndarray, " C"]) -> Any:
-        """The best changes, all of them or without the last, and half the sum of the losses."""
+        """The best changes from a start on, and half the sum of the losses."""
         return least_squares(
             self.residuals,
             start,
@@ -225,14 +236,14 @@ class _Problem:
         return self.middle + changes[3:6] * np.linalg.norm(self.middle)
 
     def _changed(self, changes: Float64[np.ndarray, " C"]) -> Float64[np.ndarray, "5"]:
-        focal, x, y, radial, _ = self.lens
+        focal, _, _, radial, _ = self.lens
+        shift = changes[WHOLE:CROPPED] if len(changes) > WHOLE else np.zeros(2)
         return np.array(
             [
                 focal * np.exp(np.clip(changes[6], -MOST, MOST)),
-                x + self.side * changes[8],
-                y + self.side * changes[9],
+                *(self.center + self.side * shift),
                 radial + changes[7] / self.edge,
-                changes[10] if len(changes) == PARAMETERS else 0.0,
+                changes[CROPPED] if len(changes) > CROPPED else 0.0,
             ]
         )
 
