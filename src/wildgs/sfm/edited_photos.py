@@ -32,8 +32,8 @@ ASPECT_SPREAD = 0.005
 """Scale of the prior of the logarithm of the aspect ratio of pixels."""
 
 LEAST_GAIN = 5.0
-"""Smallest gain in logarithm of the posterior probability from which a photo is taken for cropped or stretched. Else
-its principal point is the centre, and its pixels are square."""
+"""Smallest gain in logarithm of the posterior probability from which a photo is taken for cropped or stretched.
+Otherwise its principal point is the centre, and its pixels are square."""
 
 LEAST_OBSERVATIONS = 40
 """Smallest number of observations of points that others confirm, from which a photo's camera is fitted."""
@@ -45,9 +45,9 @@ EVALUATIONS = 60
 """Upper bound on evaluations of the residuals of a photo, without those for derivatives."""
 
 WHOLE, CROPPED, STRETCHED = 8, 10, 11
-"""Numbers of parameters of a photo: rotation about the middle of the points (a rotation vector), translation relative
-to their distance, logarithm of the focal length, distortion of the outermost point; displacement of the principal
-point from the centre relative to the longer side; and logarithm of the aspect ratio."""
+"""Numbers of parameters of a photo: rotation about the middle of the points (a rotation vector), translation
+relative to their distance, logarithm of the focal length, distortion of the outermost point; displacement of the
+principal point from the centre relative to the longer side; and logarithm of the aspect ratio."""
 
 MOST = 2.0
 """Largest change of a logarithm, beyond which least squares may look for a solution but does not find one."""
