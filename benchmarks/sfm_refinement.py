@@ -65,7 +65,7 @@ class Kept:
         if not (self._output / "before").exists():
             move, refinement.refine_keypoints = (
                 refinement.refine_keypoints,
-                lambda work, model, _: (model, set()),
+                lambda work, model, *_: (model, set()),
             )
             detected = self._refine(work, model, *rest)
             refinement.refine_keypoints = move

@@ -186,7 +186,7 @@ def test_refinement_ends_with_them_and_bundle_adjustment_keeps_their_lenses(
     """Nothing can be aligned in grey photos, but all features are taken for aligned here."""
     work, model = made
 
-    def as_they_are(work: Workplace, model: Any, progress: Any) -> tuple[Any, set[tuple[int, int]]]:
+    def as_they_are(work: Workplace, model: Any, *_: Any) -> tuple[Any, set[tuple[int, int]]]:
         tracks = [model.point3D(point).track for point in model.point3D_ids()]
         return pycolmap.Reconstruction(model), {
             (e.image_id, e.point2D_idx) for t in tracks for e in t.elements

@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from wildgs.scene.images import UnreadableImageError
 from wildgs.sfm.keypoint_refinement import LEAST_OBSERVATIONS, refine_keypoints
 from wildgs.sfm.tracks import Tracks, rows_by_photo
 from wildgs.sfm.workplace import Workplace
@@ -143,6 +144,22 @@ def test_a_photo_from_nearby_is_sampled_more_coarsely(made: Made) -> None:
     by_photo = {photo: float(np.median(sizes[rows])) for photo, rows in rows_by_photo(tracks.photos)}
     assert by_photo[2] == pytest.approx(2.0, rel=0.15)
     assert by_photo[4] == pytest.approx(1.0, rel=0.15)
+
+
+def test_a_camera_next_to_a_point_is_no_error(made: Made) -> None:
+    """It shows a patch millions of times as large as the others."""
+    image = made.model.image(3)
+    place = made.model.point3D(made.model.point3D_ids().pop()).xyz
+    rotation = image.cam_from_world().rotation
+    image.frame.set_cam_from_world(3, pycolmap.Rigid3d(rotation, [0, 0, 2e-6] - rotation * place))
+    _, aligned = refine_keypoints(made.work, made.model, nothing)
+    assert len(aligned) > 50
+
+
+def test_photos_that_are_too_large_are_refused_as_at_first(made: Made) -> None:
+    with pytest.raises(UnreadableImageError, match="pixels"):
+        refine_keypoints(made.work, made.model, nothing, SIZE[0] * SIZE[1] - 1)
+    assert refine_keypoints(made.work, made.model, nothing, SIZE[0] * SIZE[1])[1]
 
 
 def test_points_behind_a_camera_and_models_without_points_are_left_alone(made: Made) -> None:

@@ -19,6 +19,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from wildgs.progress import Counter
+from wildgs.scene.config import MAX_IMAGE_PIXELS
 from wildgs.scene.images import read_photo
 from wildgs.sfm.track_kernels import FARTHEST, RADIUS, align_tracks
 from wildgs.sfm.tracks import Tracks, rows_by_photo
@@ -38,26 +39,33 @@ WINDOW = 2 * (2 * RADIUS + int(FARTHEST)) + 1
 """Side of the part of a photo in which an observation is aligned, pixels. A patch may be twice as large as that of
 the reference and is then sampled in pixels of two."""
 
+LARGEST_STRETCH = 64.0
+"""Upper bound on the pixels of a photo for each pixel in which a patch is sampled. Of patches that are larger yet,
+only a part is in the window, and they are not aligned."""
+
 Observation = tuple[int, int]
 """Image id, and index of the feature."""
 
 
-def refine_keypoints(work: Workplace, model: Any, progress: Counter) -> tuple[Any, set[Observation]]:
+def refine_keypoints(
+    work: Workplace, model: Any, progress: Counter, max_pixels: int = MAX_IMAGE_PIXELS
+) -> tuple[Any, set[Observation]]:
     """Moves the features of points that several photos show to where these show the same.
 
     Args:
         work: The workplace with the photos, and the database with their features.
         model: The model, whose cameras and points say how patches are warped; not modified.
         progress: Called with (photos read, total number of photos).
+        max_pixels: Largest number of pixels of a photo.
 
     Returns:
         A copy of the model with moved features, and the observations that could be aligned.
     """
     tracks = Tracks.of(work, model, LEAST_OBSERVATIONS)
     stretch = np.sqrt(np.abs(np.linalg.det(tracks.warps)))
-    scales = 2.0 ** np.round(np.log2(np.maximum(stretch, 1.0)))
+    scales = 2.0 ** np.round(np.log2(np.clip(stretch, 1.0, LARGEST_STRETCH)))
     warps = tracks.warps / scales[:, None, None]
-    windows, places = cut_windows(work, model, tracks, scales, progress)
+    windows, places = cut_windows(work, model, tracks, scales, progress, max_pixels)
     moves, likeness = np.zeros_like(tracks.pixels), np.full(len(tracks.photos), -1.0)
     launch(
         align_tracks, windows, places, warps, tracks.starts, tracks.references, patch_weights(), moves, likeness,
@@ -79,7 +87,12 @@ def patch_weights() -> Float64[np.ndarray, " K"]:
 
 
 def cut_windows(
-    work: Workplace, model: Any, tracks: Tracks, scales: Float64[np.ndarray, " O"], progress: Counter
+    work: Workplace,
+    model: Any,
+    tracks: Tracks,
+    scales: Float64[np.ndarray, " O"],
+    progress: Counter,
+    max_pixels: int = MAX_IMAGE_PIXELS,
 ) -> tuple[UInt8[np.ndarray, "O S S"], Float64[np.ndarray, "O 2"]]:
     """Cuts out what photos show around observations; beyond their edges it is 0.
 
@@ -89,6 +102,7 @@ def cut_windows(
         tracks: The observations.
         scales: Side of the pixels of each window, a power of two, in pixels of the photo.
         progress: Called with (photos read, total number of photos).
+        max_pixels: Largest number of pixels of a photo.
 
     Returns:
         Grey values, and the column and row of the observation in each window.
@@ -97,7 +111,8 @@ def cut_windows(
     places = np.zeros((len(scales), 2))
     photos = list(rows_by_photo(tracks.photos))
     for done, (photo, rows) in enumerate(photos, start=1):
-        grey = Image.fromarray(read_photo(work.images / model.image(photo).name).pixels).convert("L")
+        pixels = read_photo(work.images / model.image(photo).name, max_pixels=max_pixels).pixels
+        grey = Image.fromarray(pixels).convert("L")
         for scale in np.unique(scales[rows]):
             smaller = grey.reduce(int(scale)) if scale > 1 else grey
             smooth = np.round(gaussian_filter(np.asarray(smaller, np.float32), SMOOTHING)).astype(np.uint8)

@@ -98,7 +98,8 @@ def refine(
     matches = with_guided_matches(work, first, verified, guided, show)
     second = _adjusted(work, triangulate(first, matches, config), first, verified, count, config, constant)
     rough = triangulate(first if second is None else second, matches, config)
-    moved, aligned = refine_keypoints(work, rough, counter(progress, "aligning features"))
+    show = counter(progress, "aligning features")
+    moved, aligned = refine_keypoints(work, rough, show, config.max_image_pixels)
     if not aligned:
         return rough
     _keep_alone(moved, aligned)
