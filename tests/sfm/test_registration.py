@@ -65,6 +65,30 @@ def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:
     assert {first.name, late.name} <= registered, "photos of the first pass are kept"
 
 
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize("wrong", [True, False])
+def test_photos_of_the_first_pass_are_dropped_if_nothing_supports_them(
+    tmp_path: Path, alone: bool, wrong: bool
+) -> None:
+    """Their matches contradict them, and they share hardly any point; one of both is not enough."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig = 10, 1
+    work = Workplace(tmp_path)
+    with pycolmap.Database.open(work.database) as database:
+        model = pycolmap.synthesize_dataset(options, database)
+    image = model.image(model.reg_image_ids()[0])
+    if alone:
+        for row in image.get_observation_point2D_idxs()[NEIGHBOUR_POINTS - 1 :]:
+            model.delete_observation(image.image_id, row)
+    if wrong:
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0.4, -0.3, 0.5]), [0.5, 0.2, 0.1])
+        image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    drop_unsure(model, work, {})
+    dropped = image.name not in {model.image(number).name for number in model.reg_image_ids()}
+    assert dropped == (alone and wrong)
+
+
 def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[WorkingCopy]]) -> None:
     work, copies = matched
     main = map_photos(work, len(copies), SfmConfig(), silent)[0]
