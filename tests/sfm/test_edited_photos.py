@@ -15,7 +15,7 @@ from tests.sfm.test_refinement import write_grey_photos
 from wildgs.progress import silent
 from wildgs.sfm import edited_photos, refinement
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.edited_photos import LEAST_OBSERVATIONS, fit_edited, with_square_pixels
+from wildgs.sfm.edited_photos import LEAST_OBSERVATIONS, fit_edited, has_edited, with_square_pixels
 from wildgs.sfm.lenses import lens_fault, stretched_lenses
 from wildgs.sfm.refinement import refine
 from wildgs.sfm.workplace import Workplace
@@ -131,6 +131,21 @@ def test_stretched_lenses_can_be_implausible(made: tuple[Workplace, Any]) -> Non
     assert lens_fault(camera) is None
     camera.params = [*camera.params[:4], 9.0, 0.0, 0.0, 0.0]
     assert "distortion" in str(lens_fault(camera))
+
+
+def test_a_model_of_whole_photos_is_not_adjusted_again(
+    made: tuple[Workplace, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work, model = made
+    photos = sorted(model.reg_image_ids())
+    for row in (CROPPED, STRETCHED):
+        model.deregister_frame(model.image(photos[row]).frame_id)
+    assert not has_edited(model)
+    monkeypatch.setattr(refinement, "_adjusted", None)
+    kept = refinement._with_edited_photos(work, model, {}, 8, SfmConfig(), set())
+    assert kept is model
+    lens(model, 0).params = [FOCAL, WIDTH / 2 + 1, HEIGHT / 2, 0.0]
+    assert has_edited(model)
 
 
 def test_constant_lenses_and_photos_with_few_points_stay(

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from wildgs.scene.images import UnreadableImageError
-from wildgs.sfm.keypoint_refinement import LEAST_OBSERVATIONS, refine_keypoints
+from wildgs.sfm.keypoint_refinement import refine_keypoints
 from wildgs.sfm.tracks import Tracks, rows_by_photo
 from wildgs.sfm.workplace import Workplace
 
@@ -110,7 +110,7 @@ def inconsistency(model: Any, tracks: Tracks, observations: set[tuple[int, int]]
 
 
 def test_features_move_to_what_the_reference_shows(made: Made) -> None:
-    tracks = Tracks.of(made.work, made.model, LEAST_OBSERVATIONS)
+    tracks = Tracks.of(made.work, made.model)
     moved, aligned = refine_keypoints(made.work, made.model, nothing)
     before, after = (inconsistency(model, tracks, aligned) for model in (made.model, moved))
     assert len(after) > 120
@@ -139,7 +139,7 @@ def test_the_model_is_not_modified_and_keeps_its_points(made: Made) -> None:
 
 
 def test_a_photo_from_nearby_is_sampled_more_coarsely(made: Made) -> None:
-    tracks = Tracks.of(made.work, made.model, LEAST_OBSERVATIONS)
+    tracks = Tracks.of(made.work, made.model)
     sizes = np.sqrt(np.abs(np.linalg.det(tracks.warps)))
     by_photo = {photo: float(np.median(sizes[rows])) for photo, rows in rows_by_photo(tracks.photos)}
     assert by_photo[2] == pytest.approx(2.0, rel=0.15)

@@ -20,6 +20,17 @@ def registration(work: Workplace, copies: list[WorkingCopy]) -> Registration:
     return Registration(work, copies, describe_photos(work, copies, 0), SfmConfig(), silent)
 
 
+def synthesized(folder: Path) -> tuple[Workplace, pycolmap.Reconstruction]:
+    """A workplace and the model of ten generated photos."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig = 10, 1
+    work = Workplace(folder)
+    with pycolmap.Database.open(work.database) as database:
+        model = pycolmap.synthesize_dataset(options, database)
+    return work, model
+
+
 def test_a_photo_with_an_implausible_lens_is_placed_with_a_plain_one(
     matched: tuple[Workplace, list[WorkingCopy]],
 ) -> None:
@@ -46,12 +57,7 @@ def test_other_photos_are_not_tried(matched: tuple[Workplace, list[WorkingCopy]]
 
 
 def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig = 10, 1
-    work = Workplace(tmp_path)
-    with pycolmap.Database.open(work.database) as database:
-        model = pycolmap.synthesize_dataset(options, database)
+    work, model = synthesized(tmp_path)
     first, lonely, late = (model.image(i) for i in model.reg_image_ids()[:3])
     for image in (first, lonely):  # a few points are left, each seen by other photos
         rows = image.get_observation_point2D_idxs()
@@ -71,12 +77,7 @@ def test_photos_of_the_first_pass_are_dropped_if_nothing_supports_them(
     tmp_path: Path, alone: bool, wrong: bool
 ) -> None:
     """Their matches contradict them, and they share hardly any point; one of both is not enough."""
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig = 10, 1
-    work = Workplace(tmp_path)
-    with pycolmap.Database.open(work.database) as database:
-        model = pycolmap.synthesize_dataset(options, database)
+    work, model = synthesized(tmp_path)
     image = model.image(model.reg_image_ids()[0])
     if alone:
         for row in image.get_observation_point2D_idxs()[NEIGHBOUR_POINTS - 1 :]:

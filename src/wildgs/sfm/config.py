@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from wildgs.errors import UserError
 from wildgs.scene.config import MAX_IMAGE_PIXELS
 
+CONFIRMED = 3
+"""Number of photos from which a point moves cameras."""
+
 
 @dataclass(frozen=True)
 class PairingConfig:

@@ -23,6 +23,7 @@ import pycolmap
 from jaxtyping import Float64
 from scipy.optimize import least_squares
 
+from wildgs.sfm.config import CONFIRMED
 from wildgs.sfm.lens_priors import RESIDUAL
 
 CENTER_SPREAD = 0.03
@@ -37,9 +38,6 @@ Otherwise its principal point is the centre, and its pixels are square."""
 
 LEAST_OBSERVATIONS = 40
 """Smallest number of observations of points that others confirm, from which a photo's camera is fitted."""
-
-CONFIRMED = 3
-"""Number of photos from which a point counts."""
 
 EVALUATIONS = 60
 """Upper bound on evaluations of the residuals of a photo, without those for derivatives."""
@@ -73,6 +71,15 @@ def fit_edited(model: Any, scale: float, constant: Collection[int] = ()) -> int:
         if image.camera_id not in constant and image.camera.model_name in ("SIMPLE_RADIAL", "OPENCV"):
             fitted += _fit(model, image, scale)
     return fitted
+
+
+def has_edited(model: Any) -> bool:
+    """Whether a photo of a model is cropped or stretched, by its camera."""
+    return any(
+        camera.model_name == "OPENCV"
+        or (camera.principal_point_x, camera.principal_point_y) != (camera.width / 2, camera.height / 2)
+        for camera in (model.image(photo).camera for photo in model.reg_image_ids())
+    )
 
 
 def with_square_pixels(model: Any, scale: float) -> Any:

@@ -26,9 +26,6 @@ from wildgs.sfm.tracks import Tracks, rows_by_photo
 from wildgs.sfm.workplace import Workplace
 from wildgs.threads import launch
 
-LEAST_OBSERVATIONS = 3
-"""Number of observations from which those of a point are moved; other points do not move cameras."""
-
 SMOOTHING = 0.5
 """Standard deviation by which photos are smoothed, pixels."""
 
@@ -61,7 +58,7 @@ def refine_keypoints(
     Returns:
         A copy of the model with moved features, and the observations that could be aligned.
     """
-    tracks = Tracks.of(work, model, LEAST_OBSERVATIONS)
+    tracks = Tracks.of(work, model)
     stretch = np.sqrt(np.abs(np.linalg.det(tracks.warps)))
     scales = 2.0 ** np.round(np.log2(np.clip(stretch, 1.0, LARGEST_STRETCH)))
     warps = tracks.warps / scales[:, None, None]

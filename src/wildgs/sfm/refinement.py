@@ -27,8 +27,8 @@ import pycolmap
 
 from wildgs.progress import Counter as Progressed
 from wildgs.progress import Progress, counter
-from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.edited_photos import fit_edited
+from wildgs.sfm.config import CONFIRMED, SfmConfig
+from wildgs.sfm.edited_photos import fit_edited, has_edited
 from wildgs.sfm.guided_matching import GuidedMatches, Matches, match_guided, neighbours
 from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
 from wildgs.sfm.keypoint_refinement import Observation, refine_keypoints
@@ -45,9 +45,6 @@ NEIGHBOURS, LEAST_SHARED = 5, 3
 GUIDED_LIMIT = 1000
 """Number of photos up to which they are matched again, for a quarter of an hour on one core. More photos have more
 matches of each point."""
-
-CONFIRMED = 3
-"""Number of photos from which a point moves cameras."""
 
 LEAST_CONFIRMED = 20
 """Number of observations of confirmed points below which a photo needs its other points as well."""
@@ -114,12 +111,12 @@ def _with_edited_photos(
 ) -> Any:
     """The model with principal points and aspect ratios, fitted in turns with the adjustment of everything else.
 
-    Of very many photos, whose adjustment takes long, once.
+    Of very many photos, whose adjustment takes long, once. A model of whole photos stays as it is.
     """
     best = model
     for _ in range(TURNS if model.num_reg_images() <= GUIDED_LIMIT else 1):
         fitted = pycolmap.Reconstruction(best)
-        if not fit_edited(fitted, EXACT_SCALE, constant):
+        if not fit_edited(fitted, EXACT_SCALE, constant) or not (has_edited(fitted) or has_edited(best)):
             break
         after = _adjusted(work, fitted, best, matches, count, config, constant, scale=EXACT_SCALE)
         if after is None or not keeps_agreement(best, after, work.database):

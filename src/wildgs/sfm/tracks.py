@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
+from wildgs.sfm.config import CONFIRMED
 from wildgs.sfm.consistent_matching import Shapes
 from wildgs.sfm.workplace import Workplace
 
@@ -43,16 +44,15 @@ class Tracks:
     references: Int64[np.ndarray, " P"]
 
     @classmethod
-    def of(cls, work: Workplace, model: Any, least: int) -> Tracks:
-        """The observations of all points that have at least `least`.
+    def of(cls, work: Workplace, model: Any) -> Tracks:
+        """The observations of all points that enough photos show.
 
         Args:
             work: The workplace, whose database knows the scales of the features.
             model: pycolmap's reconstruction.
-            least: Smallest number of observations.
         """
         points = [model.point3D(point) for point in sorted(model.point3D_ids())]
-        points = [point for point in points if point.track.length() >= least]
+        points = [point for point in points if point.track.length() >= CONFIRMED]
         elements = [(e.image_id, e.point2D_idx) for point in points for e in point.track.elements]
         photos, features = np.array(elements, np.int64).reshape(-1, 2).T
         lengths = np.array([point.track.length() for point in points], np.int64)
@@ -147,11 +147,11 @@ def _warps(
     owners = np.repeat(np.arange(len(references)), np.diff(starts))
     seen_frames = seen.slopes @ frames[owners]
     known = seen_frames[references]
-    sound = np.isfinite(seen.sides) & _is_regular(known, seen.sides[references])[owners]
+    regular = _is_regular(known, seen.sides[references])
+    sound = np.isfinite(seen.sides) & regular[owners]
     steps = np.maximum(seen.scales[references] / FEATURE_SCALE, 1.0)
     inverse = np.zeros_like(known)
-    usable = _is_regular(known, seen.sides[references])
-    inverse[usable] = np.linalg.inv(known[usable])
+    inverse[regular] = np.linalg.inv(known[regular])
     warps = seen_frames @ (inverse * steps[:, None, None])[owners]
     return np.where(sound[:, None, None], warps, 0.0)
 
