@@ -15,7 +15,13 @@ from tests.sfm.test_refinement import write_grey_photos
 from wildgs.progress import silent
 from wildgs.sfm import edited_photos, refinement
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.edited_photos import LEAST_OBSERVATIONS, fit_edited, has_edited, with_square_pixels
+from wildgs.sfm.edited_photos import (
+    LEAST_OBSERVATIONS,
+    describe_edited,
+    fit_edited,
+    has_edited,
+    with_square_pixels,
+)
 from wildgs.sfm.lenses import lens_fault, stretched_lenses
 from wildgs.sfm.refinement import refine
 from wildgs.sfm.workplace import Workplace
@@ -106,6 +112,20 @@ def test_a_stretched_photo_is_fitted_again_and_may_turn_out_not_to_be(made: tupl
     square.params = [FOCAL, 1.02 * FOCAL, WIDTH / 2, HEIGHT / 2, 0.0, 0.0, 0.0, 0.0]
     fit_edited(model, 0.5)
     assert lens(model, 0).model_name == "SIMPLE_RADIAL"
+
+
+def test_edited_photos_are_described_and_whole_ones_are_not(made: tuple[Workplace, Any]) -> None:
+    _, model = made
+    assert describe_edited(model) == {}
+    fit_edited(model, 0.5)
+    said = describe_edited(model)
+    cropped, stretched = (
+        model.image(sorted(model.reg_image_ids())[row]).name for row in (CROPPED, STRETCHED)
+    )
+    assert set(said) == {cropped, stretched}
+    assert "+15% of the width and -5% of the height" in said[cropped]
+    assert "stretched" not in said[cropped]
+    assert "stretched: its height, relative to its width, is 1.07" in said[stretched]
 
 
 def test_mapping_continues_with_square_pixels(made: tuple[Workplace, Any]) -> None:

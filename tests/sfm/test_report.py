@@ -41,3 +41,12 @@ def test_few_points_per_photo_are_said(points: list[int], doubted: bool) -> None
     said = [line for line in lines if "half of the photos observe no more than" in line]
     assert bool(said) == doubted
     assert not doubted or f"no more than {FEW_POINTS - 1} of the points" in said[0]
+
+
+def test_cropped_and_stretched_photos_are_named() -> None:
+    assert not any("cropped" in line for line in REPORT.lines())
+    lines = replace(REPORT, edited={"b.jpg": "cropped: …", "a.jpg": "stretched: …"}).lines()
+    assert any(
+        "2 of the photos with a pose were cropped or stretched" in line and "a.jpg, b.jpg" in line
+        for line in lines
+    )

@@ -82,6 +82,34 @@ def has_edited(model: Any) -> bool:
     )
 
 
+def describe_edited(model: Any) -> dict[str, str]:
+    """How photos were cropped or stretched, by their cameras in a model; whole photos are left out.
+
+    Args:
+        model: pycolmap's reconstruction.
+
+    Returns:
+        Text by name of the image; principal points in percent of the photo's sides, to the right and down.
+    """
+    found = {}
+    for photo in model.reg_image_ids():
+        image = model.image(photo)
+        camera, said = image.camera, []
+        right = round(100 * camera.principal_point_x / camera.width) - 50
+        down = round(100 * camera.principal_point_y / camera.height) - 50
+        if right or down:
+            said.append(
+                f"cropped: its principal point is {right:+}% of the width and {down:+}% of the height from its"
+                " centre"
+            )
+        if camera.model_name == "OPENCV":
+            ratio = camera.focal_length_y / camera.focal_length_x
+            said.append(f"stretched: its height, relative to its width, is {ratio:.3f} times what it was")
+        if said:
+            found[image.name] = "; ".join(said)
+    return found
+
+
 def with_square_pixels(model: Any, scale: float) -> Any:
     """A copy of a model in which stretched photos have the SIMPLE_RADIAL cameras that fit its points best.
 

@@ -21,6 +21,7 @@ from wildgs.scene.colmap import LAYOUTS
 from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.edited_photos import describe_edited
 from wildgs.sfm.lookalikes import find_doubtful
 from wildgs.sfm.mapping import find_registered, quiet
 from wildgs.sfm.match_pictures import FOLDER as PICTURES
@@ -118,6 +119,7 @@ def _reconstruct(
             copies={copies[a].name: copies[b].name for a, b in poses.findings.crops.items()},
             pictures=write_match_pictures(work, copies, without),
             doubtful={names[n]: why for n, why in find_doubtful(model, work.database, names).items()},
+            edited={names[n]: how for n, how in describe_edited(model).items()},
         )
         report.write(work.scene)
         _check_output(photos, output, overwrite)  # again, as another process may have written to it

@@ -48,6 +48,7 @@ class SfmReport:
         copies: Originals of copies and crops, by name.
         doubtful: Reasons why poses are doubtful, by name.
         pictures: Image files of the best matches of photos without a pose, by name.
+        edited: How photos were cropped or stretched, which their cameras take into account, by name in the scene.
     """
 
     photos: int
@@ -66,6 +67,7 @@ class SfmReport:
     copies: Mapping[str, str] = field(default_factory=dict)
     doubtful: Mapping[str, str] = field(default_factory=dict)
     pictures: Mapping[str, str] = field(default_factory=dict)
+    edited: Mapping[str, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """The report as text."""
@@ -88,6 +90,11 @@ class SfmReport:
         if self.copies:
             text.append(
                 f"{len(self.copies)} photos are copies or crops of others: {_some(sorted(self.copies))}"
+            )
+        if self.edited:
+            text.append(
+                f"{len(self.edited)} of the photos with a pose were cropped or stretched, which their cameras take"
+                f" into account: {_some(sorted(self.edited))} ({REPORT_NAME} says how)"
             )
         if self.doubtful:
             text.append(f"{len(self.doubtful)} poses are doubtful (wrong, or photos of look-alikes):")
