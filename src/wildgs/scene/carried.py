@@ -19,7 +19,8 @@ from wildgs.errors import UserError
 from wildgs.files import check_regular, is_there, written_aside
 from wildgs.progress import Counter, in_threads
 from wildgs.scene.capture import carry_capture
-from wildgs.scene.image_cache import DECODERS, ImageCache
+from wildgs.scene.config import DECODERS
+from wildgs.scene.image_cache import ImageCache
 from wildgs.scene.images import Photo, UnreadableImageError, read_mask, read_photo
 from wildgs.scene.photo_store import PhotoStore
 from wildgs.scene.scene import Scene, View

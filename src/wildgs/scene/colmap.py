@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int, Int64, UInt8, UInt64
 from torch import Tensor
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import describe_names
 from wildgs.geometry.camera import quats_to_rotations
 from wildgs.scene.colmap_binary import read_binary
 from wildgs.scene.colmap_records import ImageRecord, ModelFileError, ModelRecords, PointRecords
@@ -244,9 +245,3 @@ def _median_depths(
             if (depth > 0).any():
                 depths[image_id] = float(np.median(depth[depth > 0]))
     return depths
-
-
-def describe_names(names: Sequence[str], limit: int = 3) -> str:
-    """The first few names and the number of the others, for a message."""
-    shown = ", ".join(names[:limit])
-    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"

@@ -10,6 +10,9 @@ from wildgs.errors import UserError
 MAX_IMAGE_PIXELS = 250_000_000
 """Images with more pixels are rejected before decoding: a small file can decode to more than memory holds."""
 
+DECODERS = 4
+"""Number of threads that decode photos; Pillow releases the GIL."""
+
 _UNITS = {"": 1, "B": 1} | {
     prefix + ending: base ** (power + 1)
     for power, prefix in enumerate("KMGT")

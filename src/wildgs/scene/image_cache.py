@@ -15,10 +15,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from wildgs.processes import local_world_size
+from wildgs.scene.config import DECODERS
 from wildgs.scene.images import Photo
-
-DECODERS = 4
-"""Number of threads that decode photos; Pillow releases the GIL."""
 
 AHEAD = 4
 """Number of photos that are decoded in advance."""

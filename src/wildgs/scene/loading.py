@@ -10,12 +10,13 @@ from pathlib import Path
 import torch
 
 from wildgs.errors import UserError, WildGSWarning
+from wildgs.files import describe_names
 from wildgs.geometry.camera import Camera
 from wildgs.progress import Counter, in_threads
 from wildgs.scene.alignment import align_world
-from wildgs.scene.colmap import ColmapImage, ColmapModel, describe_names, read_model
-from wildgs.scene.config import IMAGE_CACHE, DataConfig, parse_bytes
-from wildgs.scene.image_cache import DECODERS, ImageCache, available_memory
+from wildgs.scene.colmap import ColmapImage, ColmapModel, read_model
+from wildgs.scene.config import DECODERS, IMAGE_CACHE, DataConfig, parse_bytes
+from wildgs.scene.image_cache import ImageCache, available_memory
 from wildgs.scene.images import UnreadableImageError
 from wildgs.scene.photo_store import ScenePhotos
 from wildgs.scene.residuals import Residuals, residuals_of

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import check_regular
-from wildgs.scene.colmap import describe_names
+from wildgs.files import check_regular, describe_names
 from wildgs.scene.scene import Split
 
 MAX_FILE_BYTES = 100 * 10**6

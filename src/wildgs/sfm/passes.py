@@ -11,11 +11,12 @@ from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.enlarged import enlarge_small
 from wildgs.sfm.incremental import measure_distortion
 from wildgs.sfm.lenses import drop_impossible
-from wildgs.sfm.mapping import map_repeatedly, missing_from
+from wildgs.sfm.mapping import missing_from
 from wildgs.sfm.matching import describe_photos, extract, match
 from wildgs.sfm.pairs import Pairing
 from wildgs.sfm.placement import Findings, PassName
 from wildgs.sfm.registration import Registration, names_of
+from wildgs.sfm.repeated_mapping import map_repeatedly
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 

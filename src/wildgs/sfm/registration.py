@@ -18,10 +18,8 @@ from wildgs.sfm.incremental import LEAST_GROUP, by_size
 from wildgs.sfm.lookalikes import find_doubtful, keeps_agreement
 from wildgs.sfm.mapping import (
     continue_mapping,
-    is_better,
     lenses_of,
     map_photos,
-    map_repeatedly,
     missing_from,
 )
 from wildgs.sfm.matching import forget_pairs, match_pairs, verified_pairs
@@ -29,6 +27,7 @@ from wildgs.sfm.pairs import Pair, alike_pairs, friends_of_friends
 from wildgs.sfm.placement import PassName, count_neighbours, find_groups
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.refinement import refine
+from wildgs.sfm.repeated_mapping import is_better, map_repeatedly
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 

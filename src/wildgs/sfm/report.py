@@ -9,8 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from wildgs.files import printable, read_json
-from wildgs.scene.colmap import describe_names
+from wildgs.files import describe_names, printable, read_json
 from wildgs.sfm.pairs import PairingName
 from wildgs.sfm.placement import PassName, Placement
 

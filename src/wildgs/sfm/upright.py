@@ -14,12 +14,10 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from PIL import Image
 
 from wildgs.errors import UserError, WildGSWarning
-from wildgs.files import is_file, is_unprintable, printable
+from wildgs.files import describe_names, is_file, is_unprintable, printable
 from wildgs.progress import Counter, in_threads
 from wildgs.scene.capture import read_place
-from wildgs.scene.colmap import describe_names
-from wildgs.scene.config import MAX_IMAGE_PIXELS
-from wildgs.scene.image_cache import DECODERS
+from wildgs.scene.config import DECODERS, MAX_IMAGE_PIXELS
 from wildgs.scene.images import (
     EXIF_ORIENTATION,
     UnreadableImageError,

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from wildgs.errors import WildGSWarning
-from wildgs.files import written_aside
+from wildgs.files import describe_names, written_aside
 from wildgs.priors.config import StereoConfig
 from wildgs.priors.ground_plane import find_ground
 from wildgs.priors.measured_displacements import measured_displacements
@@ -22,7 +22,7 @@ from wildgs.priors.stereo.neighbours import choose_neighbours, seen_rows
 from wildgs.priors.stereo.photos import Level, Planes
 from wildgs.priors.stereo.search import Search
 from wildgs.scene import Scene, load_scene
-from wildgs.scene.colmap import describe_names, read_model
+from wildgs.scene.colmap import read_model
 from wildgs.scene.config import DataConfig
 from wildgs.scene.photo_store import depth_files, metric_file
 from wildgs.scene.undistort import PixelGrid, sample_depth

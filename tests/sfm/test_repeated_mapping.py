@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from wildgs.progress import silent
-from wildgs.sfm import mapping
+from wildgs.sfm import mapping_ahead, repeated_mapping
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -69,14 +69,16 @@ def test_mapping_is_repeated_while_photos_are_missing(
         seeds.append(config.seed)
         return [FakeModel(names, 100 * len(names))] if names else []
 
-    monkeypatch.setattr(mapping, "map_photos", run)
-    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter([(1, 2)]))
-    monkeypatch.setattr(mapping, "PAIR_ATTEMPTS", 0)
-    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (int(1000 * agreeing), 1000))
-    monkeypatch.setattr(mapping, "is_wide", lambda model: True)
-    monkeypatch.setattr(mapping, "FEW", 3 if few else 2)
-    monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 4)
-    models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(seed=5), silent)
+    monkeypatch.setattr(mapping_ahead, "map_photos", run)
+    monkeypatch.setattr(repeated_mapping, "initial_pairs", lambda *_: iter([(1, 2)]))
+    monkeypatch.setattr(repeated_mapping, "PAIR_ATTEMPTS", 0)
+    monkeypatch.setattr(repeated_mapping, "count_agreeing", lambda *_: (int(1000 * agreeing), 1000))
+    monkeypatch.setattr(repeated_mapping, "is_wide", lambda model: True)
+    monkeypatch.setattr(repeated_mapping, "FEW", 3 if few else 2)
+    monkeypatch.setattr(repeated_mapping, "FEW_ATTEMPTS", 4)
+    models = repeated_mapping.map_repeatedly(
+        Workplace(tmp_path), copies, SfmConfig(seed=5, threads=1), silent
+    )
     assert [model.names for model in models] == ([] if best is None else [runs[best]])
     assert seeds == [5, 6, 7, 8][:tried]
 
@@ -88,14 +90,14 @@ def test_matches_that_agree_outweigh_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: tuple[int, int], distorted: bool, best: int
 ) -> None:
     """The first run has more observations; the second expects strong distortion, and counts if it finds it."""
-    monkeypatch.setattr(mapping, "is_wide", lambda model: distorted)
+    monkeypatch.setattr(repeated_mapping, "is_wide", lambda model: distorted)
     copies = [WorkingCopy("a.jpg", "a", "a.jpg", False)]
     models, counts = iter([FakeModel(["a"], 900), FakeModel(["a"], 800)]), iter(agreeing)
-    monkeypatch.setattr(mapping, "FEW_ATTEMPTS", 2)
-    monkeypatch.setattr(mapping, "map_photos", lambda *_, **__: [next(models)])
-    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(()))
-    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (next(counts), 1000))
-    found = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    monkeypatch.setattr(repeated_mapping, "FEW_ATTEMPTS", 2)
+    monkeypatch.setattr(mapping_ahead, "map_photos", lambda *_, **__: [next(models)])
+    monkeypatch.setattr(repeated_mapping, "initial_pairs", lambda *_: iter(()))
+    monkeypatch.setattr(repeated_mapping, "count_agreeing", lambda *_: (next(counts), 1000))
+    found = repeated_mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(threads=1), silent)
     assert found[0].observations == (900, 800)[best]
 
 
@@ -126,13 +128,13 @@ def test_other_initial_pairs_are_tried_where_a_model_does_not_grow_or_agree(
         size = sizes[0] if pair is None else sizes[1 + pair[0]]
         return [FakeModel([f"{row}" for row in range(size)], size)] if size else []
 
-    monkeypatch.setattr(mapping, "map_photos", run)
-    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(pairs))
-    monkeypatch.setattr(mapping, "count_agreeing", lambda *_: (int(10 * share), 10))
-    monkeypatch.setattr(mapping, "is_wide", lambda model: True)
-    models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    monkeypatch.setattr(mapping_ahead, "map_photos", run)
+    monkeypatch.setattr(repeated_mapping, "initial_pairs", lambda *_: iter(pairs))
+    monkeypatch.setattr(repeated_mapping, "count_agreeing", lambda *_: (int(10 * share), 10))
+    monkeypatch.setattr(repeated_mapping, "is_wide", lambda model: True)
+    models = repeated_mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(threads=1), silent)
     assert models[0].num_reg_images() == photos
-    assert asked == [None] * mapping.FIRST_ATTEMPTS + pairs[: tried - 1]
+    assert asked == [None] * repeated_mapping.FIRST_ATTEMPTS + pairs[: tried - 1]
 
 
 @pytest.mark.parametrize(("shares", "best"), [((0.6, 0.65), 1), ((0.6, 0.58), 0), ((0.6, 0.58, 0.61), 2)])
@@ -150,10 +152,12 @@ def test_other_pairs_have_to_be_more_exact_unless_the_model_is_stuck(
     def agreeing(model: FakeModel, *_: object) -> tuple[int, int]:
         return int(100_000 * shares[model.observations]), 100_000
 
-    monkeypatch.setattr(mapping, "map_photos", run)
-    monkeypatch.setattr(mapping, "initial_pairs", lambda *_: iter(pairs))
+    monkeypatch.setattr(mapping_ahead, "map_photos", run)
+    monkeypatch.setattr(repeated_mapping, "initial_pairs", lambda *_: iter(pairs))
     # More photos have more matches, too.
-    monkeypatch.setattr(mapping, "_judge", lambda model, _: (len(model.names), agreeing(model)[0] / 100_000))
-    monkeypatch.setattr(mapping, "is_wide", lambda model: True)
-    models = mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    monkeypatch.setattr(
+        repeated_mapping, "_judge", lambda model, _: (len(model.names), agreeing(model)[0] / 100_000)
+    )
+    monkeypatch.setattr(repeated_mapping, "is_wide", lambda model: True)
+    models = repeated_mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(threads=1), silent)
     assert models[0].observations == best
