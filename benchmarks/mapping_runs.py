@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -59,24 +59,34 @@ def describe(models: Sequence[Any], work: Workplace) -> str:
     )
 
 
-def main(command: Command) -> None:
-    """Prints the runs."""
+FirstPass = Callable[[Workplace, Sequence[WorkingCopy], SfmConfig, Progress], None]
+
+
+def after_matching(photos: Path, first_pass: FirstPass, config: SfmConfig | None = None) -> None:
+    """Matches a folder of photos, and calls a function in place of the first pass."""
     warnings.simplefilter("ignore", WildGSWarning)
 
-    def runs(
-        work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress
-    ) -> list[Any]:
+    def call(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> Any:
+        first_pass(work, copies, config, progress)
+        raise _EnoughError
+
+    passes.map_repeatedly = call
+    with tempfile.TemporaryDirectory() as folder, suppress(_EnoughError):
+        wildgs.reconstruct(photos, Path(folder) / "scene", config)
+
+
+def main(command: Command) -> None:
+    """Prints the runs."""
+
+    def runs(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> None:
         for seed in range(command.seeds):
             models = map_photos(work, len(copies), replace(config, seed=seed), progress)
             print(f"seed {seed}: {describe(models, work)}", flush=True)
         for number, pair in enumerate(islice(initial_pairs(work.database), command.pairs), start=1):
             models = map_photos(work, len(copies), config, progress, pair=pair)
             print(f"pair {number}: {describe(models, work)}", flush=True)
-        raise _EnoughError
 
-    passes.map_repeatedly = runs
-    with tempfile.TemporaryDirectory() as folder, suppress(_EnoughError):
-        wildgs.reconstruct(command.photos, Path(folder) / "scene")
+    after_matching(command.photos, runs)
 
 
 if __name__ == "__main__":

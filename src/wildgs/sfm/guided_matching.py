@@ -20,7 +20,9 @@ from jaxtyping import Float32, Float64, Int64, UInt32
 from scipy.sparse import csr_array
 
 from wildgs.progress import Counter as Progressed
+from wildgs.sfm.guided_kernels import find_clear
 from wildgs.sfm.lookalikes import essential_matrix, unproject
+from wildgs.threads import launch
 
 ImagePair = tuple[int, int]
 """Ids of two images, the smaller one first."""
@@ -39,9 +41,6 @@ LARGEST_ANGLE = 0.8
 
 SAME_PLACE = 3.0
 """Distance up to which features are at one place, pixels: the same corner has several of different sizes."""
-
-BLOCK = 1024
-"""Features of the first photo that are compared with those of the second at a time, which limits memory."""
 
 CACHED_PHOTOS = 64
 """Photos whose features are kept in memory, 5 MB each."""
@@ -137,49 +136,38 @@ def _match(
     first: _Features, second: _Features, essential: Float64[np.ndarray, "3 3"]
 ) -> UInt32[np.ndarray, "_ 2"]:
     """Mutually best matches near epipolar lines that are clearly better than the second best elsewhere."""
-    lines, other_lines = first.rays @ essential.T, second.rays @ essential
-    limits = second.reach * np.hypot(lines[:, :1], lines[:, 1:2]).astype(np.float32)
-    other_limits = first.reach * np.hypot(other_lines[:, 0], other_lines[:, 1]).astype(np.float32)
-    found = []
-    for start in range(0, len(lines), BLOCK):
-        block = slice(start, start + BLOCK)
-        residuals = np.abs(lines[block].astype(np.float32) @ second.rays.T.astype(np.float32))
-        near = residuals < limits[block]
-        near &= residuals < other_limits
-        rows, columns = np.nonzero(near)
-        likeness = (first.descriptors[block] @ second.descriptors.T)[rows, columns]
-        found.append((rows + start, columns, np.arccos(np.minimum(likeness, 1))))
-    if not found:
-        return np.zeros((0, 2), np.uint32)
-    rows, columns, angles = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    clear = _is_clear(rows, columns, angles, second.pixels) & _is_clear(columns, rows, angles, first.pixels)
-    return np.stack([rows[clear], columns[clear]], axis=1).astype(np.uint32)
+    lines, back = first.rays @ essential.T, second.rays @ essential
+    limits = second.reach * np.hypot(lines[:, 0], lines[:, 1])
+    back_limits = first.reach * np.hypot(back[:, 0], back[:, 1])
+    there = _find_clear(first, lines, limits, second, back_limits)
+    again = _find_clear(second, back, back_limits, first, limits)
+    rows = np.flatnonzero(there >= 0)
+    rows = rows[again[there[rows]] == rows]
+    return np.stack([rows, there[rows]], axis=1).astype(np.uint32)
 
 
-def _is_clear(
-    owners: Int64[np.ndarray, " C"],
-    others: Int64[np.ndarray, " C"],
-    angles: Float32[np.ndarray, " C"],
-    pixels: Float64[np.ndarray, "F 2"],
-) -> np.ndarray:
-    """Which candidates are the best of their owner and pass the ratio test against those at other places.
-
-    Args:
-        owners: The feature that each candidate is for.
-        others: The feature of the other photo.
-        angles: Angles between their descriptors.
-        pixels: Positions of the other photo's features.
-    """
-    clear = np.zeros(len(owners), dtype=bool)
-    if not len(owners):
-        return clear
-    order = np.lexsort((angles, owners))
-    starts = np.flatnonzero(np.diff(owners[order], prepend=-1))
-    best = order[starts]
-    lengths = np.diff(np.append(starts, len(order)))
-    winners = np.repeat(best, lengths)
-    elsewhere = np.linalg.norm(pixels[others[order]] - pixels[others[winners]], axis=1) > SAME_PLACE
-    rivals = np.where(elsewhere, angles[order], np.float32(np.pi / 2))
-    second = np.minimum.reduceat(rivals, starts)
-    clear[best] = (angles[best] < LARGEST_ANGLE) & (angles[best] < RATIO * second)
-    return clear
+def _find_clear(
+    first: _Features,
+    lines: Float64[np.ndarray, "F 3"],
+    limits: Float64[np.ndarray, " F"],
+    second: _Features,
+    other_limits: Float64[np.ndarray, " G"],
+) -> Int64[np.ndarray, " F"]:
+    """The clearly best match of each feature among those near its line, by row; -1 for none."""
+    found = np.full(len(limits), -1, np.int64)
+    launch(
+        find_clear,
+        lines.astype(np.float32),
+        limits.astype(np.float32),
+        first.descriptors,
+        np.ascontiguousarray(second.rays[:, :2].T, np.float32),
+        other_limits.astype(np.float32),
+        second.descriptors,
+        second.pixels,
+        SAME_PLACE,
+        LARGEST_ANGLE,
+        RATIO,
+        found,
+        items=len(found),
+    )
+    return found
