@@ -6,7 +6,8 @@ gradients are computed once, and an iteration only samples the photo. Patches ha
 differ in exposure and contrast. Affine parameters are drawn towards those that the cameras say: those of a small
 patch are poorly determined, and its place with them.
 
-Threads take points. A thread's arrays of intermediate results are allocated once.
+Threads take points. A thread's arrays of intermediate results are allocated once. Arrays are copied, added and filled
+element by element, because Numba takes seconds to compile NumPy's expressions.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def align_tracks(counter, windows, places, warps, starts, references, weights, m
         likeness: Correlation with the mean of the point's patches; -1 for observations that were not aligned, [O].
     """
     samples = SIDE * SIDE
-    template, patch = np.empty(samples), np.empty(samples)
+    template, patch, total = np.empty(samples), np.empty(samples), np.empty(samples)
     jacobian = np.empty((PARAMETERS, samples))
     inverse = np.empty((PARAMETERS, PARAMETERS))
     while True:
@@ -73,14 +74,17 @@ def align_tracks(counter, windows, places, warps, starts, references, weights, m
             break
         reference = references[point]
         first, last = starts[point], starts[point + 1]
-        moves[first:last] = 0.0
-        likeness[first:last] = -1.0
+        for row in range(first, last):
+            moves[row, 0] = moves[row, 1] = 0.0
+            likeness[row] = -1.0
         if not _sample(
             windows[reference], places[reference], warps[reference], moves[reference], weights, template
         ):
             continue
         _prepare(template, weights, jacobian, inverse)
-        patches, total = 1, template.copy()
+        patches = 1
+        for sample in range(samples):
+            total[sample] = template[sample]
         for row in range(first, last):
             if row == reference:
                 continue
@@ -88,12 +92,14 @@ def align_tracks(counter, windows, places, warps, starts, references, weights, m
                 windows[row], places[row], warps[row], moves[row], template, weights, jacobian, inverse, patch
             )
             if likeness[row] >= FIRST_ALIKE:
-                total += patch
                 patches += 1
+                for sample in range(samples):
+                    total[sample] += patch[sample]
         if patches == 1:
-            likeness[first:last] = -1.0
+            _fill(likeness, first, last, -1.0)
             continue
-        template[:] = total
+        for sample in range(samples):
+            template[sample] = total[sample]
         _normalise(template, weights, 0.0)
         _prepare(template, weights, jacobian, inverse)
         likeness[reference] = 1.0
@@ -116,7 +122,13 @@ def align_tracks(counter, windows, places, warps, starts, references, weights, m
             else:
                 likeness[row] = -1.0
         if aligned < 2:
-            likeness[first:last] = -1.0
+            _fill(likeness, first, last, -1.0)
+
+
+@njit(nogil=True, fastmath=_MATHS, error_model="numpy")
+def _fill(values, first, last, value):
+    for row in range(first, last):
+        values[row] = value
 
 
 @njit(nogil=True, fastmath=_MATHS, error_model="numpy")
@@ -225,8 +237,10 @@ def _align(window, place, warp, move, template, weights, jacobian, inverse, patc
         return -1.0
     limit = FARTHEST * np.sqrt(abs(size))
     gradient, step = np.empty(PARAMETERS), np.empty(PARAMETERS)
-    change = np.zeros((2, 2))
-    before = warp.copy()
+    change, before = np.empty((2, 2)), np.empty((2, 2))
+    for k in range(2):
+        for m in range(2):
+            change[k, m], before[k, m] = 0.0, warp[k, m]
     correlation, converged = -1.0, False
     for _ in range(ITERATIONS + 1):
         if not _sample(window, place, warp, move, weights, patch):
