@@ -17,7 +17,7 @@ from wildgs.errors import UserError, WildGSWarning
 from wildgs.scene import DataConfig, load_scene
 from wildgs.scene.capture import read_capture
 from wildgs.scene.colmap import read_model
-from wildgs.sfm import matching, reconstruction
+from wildgs.sfm import matching, reconstruction, repeated_mapping
 from wildgs.sfm.config import PairingConfig, SfmConfig
 from wildgs.sfm.reconstruction import reconstruct
 from wildgs.sfm.report import describe_placed, read_left_out
@@ -28,6 +28,12 @@ Corner = tuple[list[np.ndarray], list[np.ndarray]]
 AFFINE = SfmConfig(affine_features=True)
 SMALL = SfmConfig(max_image_size=800)
 EAGER = SfmConfig(pairing=PairingConfig(exhaustive_features=0, neighbours=3), affine_features=True)
+
+
+@pytest.fixture(autouse=True)
+def few_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few photos are mapped up to 24 times if some have no pose; tests of repeated mapping do without photos."""
+    monkeypatch.setattr(repeated_mapping, "FEW_ATTEMPTS", 2)
 
 
 def save_photos(folder: Path, photos: list[np.ndarray], **exif: Image.Exif) -> Path:

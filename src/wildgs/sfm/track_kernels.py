@@ -6,8 +6,8 @@ gradients are computed once, and an iteration only samples the photo. Patches ha
 differ in exposure and contrast. Affine parameters are drawn towards those that the cameras say: those of a small
 patch are poorly determined, and its place with them.
 
-Threads take points. A thread's arrays of intermediate results are allocated once. Arrays are copied, added and filled
-element by element, because Numba takes seconds to compile NumPy's expressions.
+Threads take points. A thread's arrays of intermediate results are allocated once. Arrays are copied, added and
+filled element by element, because Numba takes seconds to compile NumPy's expressions.
 """
 
 from __future__ import annotations
