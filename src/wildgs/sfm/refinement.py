@@ -43,7 +43,7 @@ NEIGHBOURS, LEAST_SHARED = 5, 3
 """Photos with which each one is matched again, those that share most points, and the smallest number of these."""
 
 GUIDED_LIMIT = 1000
-"""Number of photos up to which they are matched again, for a quarter of an hour on one core. More photos have more
+"""Number of photos up to which they are matched again, for a few minutes on one core. More photos have more
 matches of each point."""
 
 LEAST_CONFIRMED = 20
