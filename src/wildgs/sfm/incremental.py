@@ -14,7 +14,14 @@ from typing import Any
 import pycolmap
 
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.lens_priors import ROBUST_SCALE, USUAL_SHIFT, WIDE_SHIFT, LensPrior, adjust_with_priors
+from wildgs.sfm.lens_priors import (
+    ROBUST_SCALE,
+    TOLERANCE,
+    USUAL_SHIFT,
+    WIDE_SHIFT,
+    LensPrior,
+    adjust_with_priors,
+)
 from wildgs.sfm.lenses import FOCAL_RANGE, corner_shift
 from wildgs.sfm.lookalikes import keeps_agreement
 from wildgs.sfm.workplace import Workplace
@@ -60,6 +67,7 @@ def pipeline_options(config: SfmConfig) -> Any:
     options.structure_less_registration_fallback = False
     options.ignore_watermarks = True
     options.ba_global_max_refinements = REFINEMENTS
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = TOLERANCE
     options.max_extra_param = MAX_EXTRA_PARAM
     options.min_focal_length_ratio, options.max_focal_length_ratio = FOCAL_RANGE
     return options
