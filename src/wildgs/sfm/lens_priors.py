@@ -50,8 +50,9 @@ ITERATIONS = 30
 """Upper bound on iterations of the solver in a round."""
 
 TOLERANCE = 1e-6
-"""Relative decrease of the cost in an iteration below which bundle adjustment ends: Ceres's default. COLMAP's is 0,
-with which nearly all iterations are done, and a run of mapping takes twice as long and is no better."""
+"""Relative decrease of the cost in an iteration below which an adjustment during mapping ends: Ceres's default.
+With 0, which is COLMAP's, nearly all iterations are done, and a run of mapping takes twice as long and is no
+better. The last adjustments, with a robust loss, do all of them."""
 
 ROBUST_SCALE = 1.0
 """Error from which the robust loss grows more slowly than the squared one, pixels."""
@@ -152,8 +153,9 @@ def _adjust(
     options.print_summary = False
     options.refine_extra_params = corner_shift is not None
     options.ceres.solver_options.max_num_iterations = ITERATIONS
-    options.ceres.solver_options.function_tolerance = TOLERANCE
-    if robust_scale is not None:
+    if robust_scale is None:
+        options.ceres.solver_options.function_tolerance = TOLERANCE
+    else:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = robust_scale
     summary = pycolmap.create_default_bundle_adjuster(options, config, trial).solve()
