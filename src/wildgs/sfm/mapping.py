@@ -46,6 +46,8 @@ def map_photos(
 ) -> list[Any]:
     """Runs incremental mapping on some working copies or on all; returns all models, largest first.
 
+    Sets COLMAP's random seed for the calling thread.
+
     Args:
         work: The workplace.
         count: Number of all photos.
@@ -65,6 +67,9 @@ def map_photos(
         options.multiple_models = False  # each of them would start with this pair
         _expect_few_inliers(options)
     next_photo = _counted(progress, 2, count)  # a model starts with a pair
+    pycolmap.set_random_seed(
+        config.seed
+    )  # a run depends on its own seed alone, and not on what was mapped before
     return run_pipeline(work, options, count, next_photo, wide=wide)
 
 

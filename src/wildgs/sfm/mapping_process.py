@@ -13,8 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.mapping import map_photos, quiet
 from wildgs.sfm.workplace import Workplace
@@ -43,7 +41,6 @@ def compute(work: Workplace, order: Mapping[str, Any], report: Any) -> list[Any]
     """The models of a run, largest first."""
     run = order["run"]
     config = SfmConfig(threads=order["threads"], seed=run["seed"])
-    pycolmap.set_random_seed(run["seed"])
     pair = None if run["pair"] is None else (run["pair"][0], run["pair"][1])
     return map_photos(work, order["count"], config, report, order["only"], wide=run["wide"], pair=pair)
 
