@@ -13,7 +13,7 @@ import pytest
 
 from tests.sfm.test_refinement import write_grey_photos
 from wildgs.progress import silent
-from wildgs.sfm import edited_photos, refinement
+from wildgs.sfm import refinement
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.edited_photos import (
     LEAST_OBSERVATIONS,
@@ -190,29 +190,6 @@ def test_a_principal_point_outside_the_photo_is_refused(made: tuple[Workplace, A
     before = list(image.camera.params)
     assert fit_edited(model, 0.5) == 7
     assert list(image.camera.params) == before
-
-
-@pytest.mark.parametrize("value", [-1e6, 0.0, 1e6])
-def test_any_change_has_finite_residuals(made: tuple[Workplace, Any], value: float) -> None:
-    _, model = made
-    image = model.image(sorted(model.reg_image_ids())[0])
-    problem = edited_photos._Problem.of(image, *edited_photos._observed(model, image), 0.5)
-    for parameter in (6, 10):
-        changes = np.zeros(edited_photos.STRETCHED)
-        changes[parameter] = value
-        assert np.isfinite(problem.residuals(changes)).all()
-
-
-def test_loss_has_the_derivatives_that_it_says(made: tuple[Workplace, Any]) -> None:
-    _, model = made
-    image = model.image(sorted(model.reg_image_ids())[0])
-    problem = edited_photos._Problem.of(image, *edited_photos._observed(model, image), 0.5)
-    squared, step = np.linspace(0.1, 9.0, 12), 1e-5
-    value, slope, curvature = problem.loss(squared)
-    above, below = problem.loss(squared + step), problem.loss(squared - step)
-    assert np.allclose((above[0] - below[0]) / (2 * step), slope, rtol=1e-5)
-    assert np.allclose((above[1] - below[1]) / (2 * step), curvature, rtol=1e-4)
-    assert (value > 0).all()
 
 
 def test_refinement_ends_with_them_and_bundle_adjustment_keeps_their_lenses(
