@@ -2,13 +2,15 @@
 
     python benchmarks/mapping_runs.py ../shared/data/longchamp/images --seeds 7 --pairs 9
 
-A line for each run: photos with a pose, points, observations, and the share of the verified matches that agree with
-the poses (closer than a pixel of 500). Initial pairs are those of `wildgs.sfm.initial_pairs`, in its order.
+A line for each run: photos with a pose, points, observations, the share of the verified matches that agree with the
+poses (closer than a pixel of 500), and CPU time. Initial pairs are those of `wildgs.sfm.initial_pairs`, in its
+order.
 """
 
 from __future__ import annotations
 
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -80,11 +82,13 @@ def main(command: Command) -> None:
 
     def runs(work: Workplace, copies: Sequence[WorkingCopy], config: SfmConfig, progress: Progress) -> None:
         for seed in range(command.seeds):
+            begun = time.process_time()
             models = map_photos(work, len(copies), replace(config, seed=seed), progress)
-            print(f"seed {seed}: {describe(models, work)}", flush=True)
+            print(f"seed {seed}: {describe(models, work)}, {time.process_time() - begun:.1f} s", flush=True)
         for number, pair in enumerate(islice(initial_pairs(work.database), command.pairs), start=1):
+            begun = time.process_time()
             models = map_photos(work, len(copies), config, progress, pair=pair)
-            print(f"pair {number}: {describe(models, work)}", flush=True)
+            print(f"pair {number}: {describe(models, work)}, {time.process_time() - begun:.1f} s", flush=True)
 
     after_matching(command.photos, runs)
 
