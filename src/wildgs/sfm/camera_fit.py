@@ -38,7 +38,7 @@ MOST = 2.0
 
 @dataclass(frozen=True)
 class CameraFit:
-    """Residuals of a photo by changes of its camera, of which there are `WHOLE`, `CROPPED` or `STRETCHED`.
+    """Least squares of a photo's camera, by changes of which there are `WHOLE`, `CROPPED` or `STRETCHED`.
 
     Attributes:
         pixels: Where the photo shows the points.
@@ -68,7 +68,7 @@ class CameraFit:
     def of(
         cls, image: Any, pixels: Float64[np.ndarray, "N 2"], points: Float64[np.ndarray, "N 3"], scale: float
     ) -> CameraFit:
-        """The problem of an image that observes points at pixels."""
+        """The fit of an image that observes points at pixels."""
         camera, pose = image.camera, image.cam_from_world()
         inside = pose * points
         middle = inside.mean(axis=0) if len(inside) else np.array([0.0, 0.0, 1.0])
@@ -121,9 +121,8 @@ class CameraFit:
         rays, depth = self._rays(turn, changes)
         square = (rays**2).sum(axis=1)
         scales = focal * np.array([1, np.exp(np.clip(aspect, -MOST, MOST))])
-        bend = (1 + radial * square)[:, None, None] * np.eye(2) + 2 * radial * rays[:, :, None] * rays[
-            :, None
-        ]
+        outer = rays[:, :, None] * rays[:, None]
+        bend = (1 + radial * square)[:, None, None] * np.eye(2) + 2 * radial * outer
         divide = np.concatenate([np.tile(np.eye(2), (len(rays), 1, 1)), -rays[:, :, None]], axis=2)
         by_place = scales[:, None] * (bend @ divide) / depth[:, None, None]
         result = np.zeros((len(rays), 2, len(changes)))

@@ -100,10 +100,10 @@ def with_square_pixels(model: Any, scale: float) -> Any:
     for photo in square.reg_image_ids():
         image: Any = square.image(photo)
         if image.camera.model_name == "OPENCV":
-            problem = CameraFit.of(image, *_observed(square, image), scale)
-            start = problem.start(CROPPED)
-            if not len(problem.pixels) or not problem.apply(problem.solve(start).x, image):
-                problem.apply(start, image)
+            fit = CameraFit.of(image, *_observed(square, image), scale)
+            start = fit.start(CROPPED)
+            if not len(fit.pixels) or not fit.apply(fit.solve(start).x, image):
+                fit.apply(start, image)
     for camera in square.cameras.values():
         if camera.model_name == "OPENCV":  # of photos without a pose
             lens = lens_of(camera)
@@ -116,13 +116,13 @@ def _fit(model: Any, image: Any, scale: float) -> bool:
     pixels, points = _observed(model, image)
     if len(pixels) < LEAST_OBSERVATIONS:
         return False
-    problem = CameraFit.of(image, pixels, points, scale)
-    best = problem.solve(problem.start(WHOLE))
+    fit = CameraFit.of(image, pixels, points, scale)
+    best = fit.solve(fit.start(WHOLE))
     for parameters in (CROPPED, STRETCHED):
-        trial = problem.solve(problem.start(parameters))
+        trial = fit.solve(fit.start(parameters))
         if best.cost - trial.cost > LEAST_GAIN * (RESIDUAL * scale) ** 2:
             best = trial
-    return problem.apply(best.x, image)
+    return fit.apply(best.x, image)
 
 
 def _observed(model: Any, image: Any) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, "N 3"]]:

@@ -178,8 +178,14 @@ class _Ahead:
     def _ask(self, process: subprocess.Popen[str], run: MappingRun, folder: str) -> None:
         assert process.stdin is not None
         assert process.stdout is not None
-        order = {"run": asdict(run), "count": self.count, "only": list(self.only), "folder": folder}
-        process.stdin.write(json.dumps({**order, "threads": self.config.threads}) + "\n")
+        order = {
+            "config": asdict(replace(self.config, seed=run.seed)),
+            "run": asdict(run),
+            "count": self.count,
+            "only": list(self.only),
+            "folder": folder,
+        }
+        process.stdin.write(json.dumps(order) + "\n")
         process.stdin.flush()
         for line in process.stdout:
             if line.strip() == "done":

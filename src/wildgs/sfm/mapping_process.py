@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.config import PairingConfig, SfmConfig
 from wildgs.sfm.mapping import map_photos, quiet
 from wildgs.sfm.workplace import Workplace
 
@@ -39,8 +39,8 @@ def main(root: str) -> None:
 
 def compute(work: Workplace, order: Mapping[str, Any], report: Any) -> list[Any]:
     """The models of a run, largest first."""
-    run = order["run"]
-    config = SfmConfig(threads=order["threads"], seed=run["seed"])
+    run, options = order["run"], order["config"]
+    config = SfmConfig(**{**options, "pairing": PairingConfig(**options["pairing"])})
     pair = None if run["pair"] is None else (run["pair"][0], run["pair"][1])
     return map_photos(work, order["count"], config, report, order["only"], wide=run["wide"], pair=pair)
 
