@@ -122,12 +122,16 @@ def test_an_interruption_stops_the_processes_at_once(
     assert run_folders(work) == []
 
 
-@pytest.mark.parametrize("config", [SfmConfig(threads=1), PROCESSES])
-def test_few_photos_and_one_thread_need_no_process(
-    matched: Matched, monkeypatch: pytest.MonkeyPatch, config: SfmConfig
+@pytest.mark.parametrize(
+    ("config", "least", "ahead"),
+    [(SfmConfig(threads=1), 2, True), (PROCESSES, 100, True), (PROCESSES, 2, False)],
+)
+def test_few_photos_one_thread_and_single_runs_need_no_process(
+    matched: Matched, monkeypatch: pytest.MonkeyPatch, config: SfmConfig, least: int, ahead: bool
 ) -> None:
     work, copies = matched
     monkeypatch.setattr(mapping_ahead.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
-    monkeypatch.setattr(mapping_ahead, "LEAST_PHOTOS", 2 if config.threads == 1 else len(copies) + 1)
+    monkeypatch.setattr(mapping_ahead, "LEAST_PHOTOS", least)
     monkeypatch.setattr(mapping_ahead, "map_photos", lambda *_, **__: ["model"])
-    assert list(map_each(work, len(copies), config, silent, (), RUNS)) == [(run, ["model"]) for run in RUNS]
+    found = list(map_each(work, len(copies), config, silent, (), RUNS, ahead=ahead))
+    assert found == [(run, ["model"]) for run in RUNS]

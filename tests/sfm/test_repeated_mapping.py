@@ -1,4 +1,4 @@
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -161,3 +161,24 @@ def test_other_pairs_have_to_be_more_exact_unless_the_model_is_stuck(
     monkeypatch.setattr(repeated_mapping, "is_wide", lambda model: True)
     models = repeated_mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(threads=1), silent)
     assert models[0].observations == best
+
+
+@pytest.mark.parametrize(("limit", "ahead"), [(3, True), (2, False)])
+def test_many_photos_are_mapped_once_and_nothing_ahead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, ahead: bool
+) -> None:
+    copies = [WorkingCopy(f"{name}.jpg", name, f"{name}.jpg", False) for name in "abc"]
+    asked: list[bool] = []
+
+    def each(*_: object, ahead: bool) -> Iterator[tuple[mapping_ahead.MappingRun, list[FakeModel]]]:
+        asked.append(ahead)
+        yield mapping_ahead.MappingRun(0), [FakeModel(["a", "b", "c"], 9)]
+
+    monkeypatch.setattr(repeated_mapping, "map_each", each)
+    monkeypatch.setattr(repeated_mapping, "ATTEMPTS_LIMIT", limit)
+    monkeypatch.setattr(repeated_mapping, "FEW", 0)
+    monkeypatch.setattr(repeated_mapping, "initial_pairs", lambda *_: iter(()))
+    monkeypatch.setattr(repeated_mapping, "count_agreeing", lambda *_: (9, 10))
+    models = repeated_mapping.map_repeatedly(Workplace(tmp_path), copies, SfmConfig(), silent)
+    assert len(models) == 1
+    assert asked == [ahead]

@@ -67,9 +67,8 @@ def map_photos(
         options.multiple_models = False  # each of them would start with this pair
         _expect_few_inliers(options)
     next_photo = _counted(progress, 2, count)  # a model starts with a pair
-    pycolmap.set_random_seed(
-        config.seed
-    )  # a run depends on its own seed alone, and not on what was mapped before
+    # A run depends on its own seed alone, and not on what was mapped before.
+    pycolmap.set_random_seed(config.seed)
     return run_pipeline(work, options, count, next_photo, wide=wide)
 
 

@@ -59,6 +59,8 @@ def map_each(
     progress: Progress,
     only: Sequence[str],
     runs: Iterable[MappingRun],
+    *,
+    ahead: bool = True,
 ) -> Generator[tuple[MappingRun, list[Any]]]:
     """Yields runs in their order with their models, largest first, and computes the next ones meanwhile.
 
@@ -69,29 +71,30 @@ def map_each(
         progress: Called for the photos of the run that is waited for.
         only: Names of the working copies to map; empty for all.
         runs: The runs; taken as late as possible.
+        ahead: Whether the next runs may be computed meanwhile; False where they are rarely needed.
     """
     total = config.threads if config.threads > 0 else thread_count()
     processes = min(total, MOST_PROCESSES)
-    if processes < 2 or (len(only) or count) < LEAST_PHOTOS or not sys.executable:
+    if not ahead or processes < 2 or (len(only) or count) < LEAST_PHOTOS or not sys.executable:
         for run in runs:
             yield run, _map_here(work, count, config, progress, only, run)
         return
-    ahead = _Ahead(work, replace(config, threads=total // processes), count, only)
+    others = _Ahead(work, replace(config, threads=total // processes), count, only)
     pending: deque[tuple[MappingRun, Future[list[Any]]]] = deque()
     remaining = iter(runs)
     try:
-        ahead.start(processes)
+        others.start(processes)
         while True:
             # One more than processes, so that none is idle while the caller looks at a model.
             while len(pending) <= processes and (run := next(remaining, None)) is not None:
-                pending.append((run, ahead.submit(run)))
+                pending.append((run, others.submit(run)))
             if not pending:
                 return
             run, models = pending.popleft()
-            found = ahead.wait(run, models, progress)
+            found = others.wait(run, models, progress)
             yield run, _map_here(work, count, config, progress, only, run) if found is None else found
     finally:
-        ahead.stop()
+        others.stop()
 
 
 def _map_here(

@@ -71,7 +71,8 @@ def map_repeatedly(
     attempts = FEW_ATTEMPTS if few else 1 if many else FIRST_ATTEMPTS
     runs = _runs(config.seed, attempts, initial_pairs(work.database, names, config.seed))
     best = _Best(work)
-    with closing(map_each(work, len(copies), config, progress, names, runs)) as mapped:
+    # Of many photos, one run is enough unless it is stuck, and takes long.
+    with closing(map_each(work, len(copies), config, progress, names, runs, ahead=not many)) as mapped:
         for attempt, (run, models) in enumerate(islice(mapped, attempts)):
             best.offer(models, wide=run.wide)
             complete = bool(best.models) and not missing_from(best.models[0], photos)
