@@ -7,11 +7,12 @@ from tests.sfm.conftest import LOST
 from wildgs.progress import silent
 from wildgs.sfm import registration as registration_module
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.lookalikes import LEAST_MATCHES
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
 from wildgs.sfm.pairs import Pair
-from wildgs.sfm.placement import NEIGHBOUR_POINTS, count_neighbours
-from wildgs.sfm.registration import Registration, drop_unsure
+from wildgs.sfm.placement import NEIGHBOUR_POINTS, PassName, count_neighbours
+from wildgs.sfm.registration import FEW_NEIGHBOURS, Registration, drop_unsure, names_of
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -88,6 +89,32 @@ def test_photos_of_the_first_pass_are_dropped_if_nothing_supports_them(
     drop_unsure(model, work, {})
     dropped = image.name not in {model.image(number).name for number in model.reg_image_ids()}
     assert dropped == (alone and wrong)
+
+
+@pytest.mark.parametrize("photos", [FEW_NEIGHBOURS, FEW_NEIGHBOURS + 1])
+@pytest.mark.parametrize("wrong", [True, False])
+@pytest.mark.parametrize("passes", ["first", "second"])
+def test_pairs_with_few_matches_count_against_photos_with_few_neighbours(
+    tmp_path: Path, photos: int, wrong: bool, passes: PassName
+) -> None:
+    """A look-alike shares points with some photos, and no pair of it has many matches."""
+    work, model = synthesized(tmp_path)
+    for number in model.reg_image_ids()[photos:]:
+        model.deregister_frame(model.image(number).frame_id)
+    image = model.image(model.reg_image_ids()[0])
+    assert count_neighbours(model, image) == photos - 1
+    with pycolmap.Database.open(work.database) as database:
+        for number in model.reg_image_ids()[1:]:
+            geometry = database.read_two_view_geometry(image.image_id, number)
+            geometry.inlier_matches = geometry.inlier_matches[: LEAST_MATCHES - 1]
+            database.update_two_view_geometry(image.image_id, number, geometry)
+    if wrong:
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0.4, -0.3, 0.5]), [0.5, 0.2, 0.1])
+        image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    before = names_of(model)
+    drop_unsure(model, work, {} if passes == "first" else {image.name: passes})
+    few = photos - 1 < FEW_NEIGHBOURS
+    assert before - names_of(model) == ({image.name} if wrong and few else set())
 
 
 def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[WorkingCopy]]) -> None:

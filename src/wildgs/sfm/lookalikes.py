@@ -20,6 +20,10 @@ from jaxtyping import Bool, Float64, Shaped
 LEAST_MATCHES = 30
 """Smallest number of matches of a pair to be considered; fewer are often wrong by chance."""
 
+VERIFIED = 15
+"""Smallest number of matches of a verified pair, COLMAP's default. Many pairs with as few are wrong. They are
+considered where a pose rests on little else: more of them contradict it than agree if it is wrong, too."""
+
 MAX_ERROR = 0.01
 """Largest distance from the epipolar line of a match that agrees, relative to the longer side."""
 
@@ -33,17 +37,20 @@ AGREEING_SHARE = 0.5
 """Smallest fraction of a pair's matches that must agree with the poses."""
 
 
-def find_doubtful(model: Any, database_file: Path, names: Mapping[str, str]) -> dict[str, str]:
+def find_doubtful(
+    model: Any, database_file: Path, names: Mapping[str, str], least: int = LEAST_MATCHES
+) -> dict[str, str]:
     """The reasons why poses are doubtful, by photo name.
 
     Args:
         model: pycolmap's reconstruction.
         database_file: Database with the verified matches.
         names: Names of the photos for messages.
+        least: Smallest number of matches of a pair to be considered.
     """
     agreeing: dict[str, int] = {}
     contradicting: dict[str, dict[str, int]] = {}
-    for first, second, matches in _verified(model, database_file):
+    for first, second, matches in _verified(model, database_file, least):
         share = float(agreeing_matches(first, second, matches, MAX_ERROR).mean())
         for image, other in ((first, second), (second, first)):
             if share >= AGREEING_SHARE:
@@ -105,8 +112,10 @@ def verified_matches(
                 yield pair, database.read_two_view_geometry(*pair).inlier_matches
 
 
-def _verified(model: Any, database_file: Path) -> Iterator[tuple[Any, Any, Shaped[np.ndarray, "M 2"]]]:
-    for (first, second), matches in verified_matches(model.reg_image_ids(), database_file, LEAST_MATCHES):
+def _verified(
+    model: Any, database_file: Path, least: int = LEAST_MATCHES
+) -> Iterator[tuple[Any, Any, Shaped[np.ndarray, "M 2"]]]:
+    for (first, second), matches in verified_matches(model.reg_image_ids(), database_file, least):
         yield model.image(first), model.image(second), matches
 
 
