@@ -1,4 +1,4 @@
-"""Poses by `wildgs sfm` against known ones: photos registered, AUC of the relative pose at 5 and 10 degrees, errors.
+"""Poses by `wildgs sfm` against known ones: photos registered, and errors and AUC of relative poses.
 
     python benchmarks/sfm_accuracy.py ../shared/data/gate --every 2
     python benchmarks/sfm_accuracy.py demo --mix ../shared/data/liberty --mixed 30
