@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 import pytest
 
@@ -7,6 +8,7 @@ from tests.sfm.conftest import LOST
 from wildgs.progress import silent
 from wildgs.sfm import registration as registration_module
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.incremental import LEAST_GROUP
 from wildgs.sfm.lookalikes import LEAST_MATCHES
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
@@ -115,6 +117,19 @@ def test_pairs_with_few_matches_count_against_photos_with_few_neighbours(
     drop_unsure(model, work, {} if passes == "first" else {image.name: passes})
     few = photos - 1 < FEW_NEIGHBOURS
     assert before - names_of(model) == ({image.name} if wrong and few else set())
+
+
+def test_three_photos_are_left_of_a_model_that_its_matches_contradict(tmp_path: Path) -> None:
+    work, model = synthesized(tmp_path)
+    for number in model.reg_image_ids()[FEW_NEIGHBOURS:]:
+        model.deregister_frame(model.image(number).frame_id)
+    rng = np.random.default_rng(0)
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(rng.normal(0.0, 0.5, 3)), rng.normal(0.0, 0.5, 3))
+        image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    drop_unsure(model, work, {})
+    assert model.num_reg_images() == LEAST_GROUP
 
 
 def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[WorkingCopy]]) -> None:

@@ -237,8 +237,8 @@ def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> 
 
     Those registered by a later pass have too few points, are contradicted by most of their matches, or share few
     points with every other photo; of the first pass, both of the latter. Photos with few neighbours are removed if
-    most of their matches contradict them when pairs with few matches count as well. Repeated architecture, like the
-    sides of an octagonal tower, gives points scattered over many photos.
+    most of their matches contradict them when pairs with few matches count as well, except the last three. Repeated
+    architecture, like the sides of an octagonal tower, gives points scattered over many photos.
     """
     names = {name: name for name in names_of(model)}
     doubtful = find_doubtful(model, work.database, names)
@@ -246,7 +246,7 @@ def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> 
     for image_id in list(model.reg_image_ids()):
         image, neighbours = model.image(image_id), count_neighbours(model, model.image(image_id))
         contradicted, alone = image.name in doubtful, not neighbours
-        if neighbours < FEW_NEIGHBOURS and image.name in outweighed:
+        if neighbours < FEW_NEIGHBOURS and image.name in outweighed and model.num_reg_images() > LEAST_GROUP:
             unsure = True
         elif image.name in passes:
             unsure = contradicted or alone or image.num_points3D < LEAST_POINTS
