@@ -87,10 +87,11 @@ def main() -> None:
                 errors.append(np.inf)
         scores = np.array(errors)
         known = scores[np.isfinite(scores)]
+        middle, large = np.quantile(known, [0.5, 0.9]) if len(known) else (np.nan, np.nan)
         print(
             f"{arguments.scene} every {arguments.every}: {len(found) - strangers} of {len(files)} registered,"
             f" {strangers} strangers, AUC@5 {auc(scores, 5):.3f}, AUC@10 {auc(scores, 10):.3f},"
-            f" registered pairs {np.median(known):.2f} degrees off (90%: {np.quantile(known, 0.9):.1f}),"
+            f" registered pairs {middle:.2f} degrees off (90%: {large:.1f}),"
             f" {report.points} points, {report.pairs} pairs,"
             f" other places {[len(group) for group in report.other_places]},"
             f" {time.perf_counter() - started:.0f} s"

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from wildgs.sfm.lenses import drop_impossible, lens_fault
-from wildgs.sfm.lookalikes import find_doubtful
+from wildgs.sfm.lookalikes import find_doubtful, judge_pairs
 
 
 def camera_of(focal: float, radial: float) -> pycolmap.Camera:
@@ -73,10 +73,10 @@ def test_matches_that_contradict_the_poses_make_a_photo_doubtful(
 ) -> None:
     model, file = made_up
     names = {model.image(i).name: f"photo {i}" for i in model.reg_image_ids()}
-    assert find_doubtful(model, file, names) == {}
+    assert find_doubtful(judge_pairs(model, file), names) == {}
     wrong = model.image(model.reg_image_ids()[3])
     other = model.image(model.reg_image_ids()[7])
     wrong.frame.set_cam_from_world(wrong.camera_id, other.cam_from_world())
-    doubtful = find_doubtful(model, file, names)
+    doubtful = find_doubtful(judge_pairs(model, file), names)
     assert list(doubtful) == [wrong.name]
     assert "contradict its pose" in doubtful[wrong.name]

@@ -8,8 +8,9 @@ visual relations using loop constraints", CVPR 2010.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,26 +38,54 @@ AGREEING_SHARE = 0.5
 """Smallest fraction of a pair's matches that must agree with the poses."""
 
 
-def find_doubtful(
-    model: Any, database_file: Path, names: Mapping[str, str], least: int = LEAST_MATCHES
-) -> dict[str, str]:
-    """The reasons why poses are doubtful, by photo name.
+@dataclass(frozen=True)
+class JudgedPair:
+    """A verified pair of registered photos, compared with their poses.
+
+    Attributes:
+        photos: Names of the two images.
+        matches: Number of verified matches.
+        agrees: Whether at least half of them agree with the poses.
+    """
+
+    photos: tuple[str, str]
+    matches: int
+    agrees: bool
+
+
+def judge_pairs(model: Any, database_file: Path, least: int = LEAST_MATCHES) -> list[JudgedPair]:
+    """Compares verified pairs with the poses of a model.
 
     Args:
         model: pycolmap's reconstruction.
         database_file: Database with the verified matches.
+        least: Smallest number of matches of a pair.
+    """
+    return [
+        JudgedPair(
+            (first.name, second.name),
+            len(matches),
+            float(agreeing_matches(first, second, matches, MAX_ERROR).mean()) >= AGREEING_SHARE,
+        )
+        for first, second, matches in _verified(model, database_file, least)
+    ]
+
+
+def find_doubtful(pairs: Iterable[JudgedPair], names: Mapping[str, str]) -> dict[str, str]:
+    """The reasons why poses are doubtful, by photo name.
+
+    Args:
+        pairs: The pairs that count (`judge_pairs`).
         names: Names of the photos for messages.
-        least: Smallest number of matches of a pair to be considered.
     """
     agreeing: dict[str, int] = {}
     contradicting: dict[str, dict[str, int]] = {}
-    for first, second, matches in _verified(model, database_file, least):
-        share = float(agreeing_matches(first, second, matches, MAX_ERROR).mean())
-        for image, other in ((first, second), (second, first)):
-            if share >= AGREEING_SHARE:
-                agreeing[image.name] = agreeing.get(image.name, 0) + len(matches)
+    for pair in pairs:
+        for name, other in (pair.photos, pair.photos[::-1]):
+            if pair.agrees:
+                agreeing[name] = agreeing.get(name, 0) + pair.matches
             else:
-                contradicting.setdefault(image.name, {})[other.name] = len(matches)
+                contradicting.setdefault(name, {})[other] = pair.matches
     return _judge(agreeing, contradicting, names)
 
 

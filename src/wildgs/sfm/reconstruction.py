@@ -22,7 +22,7 @@ from wildgs.scene.images import read_mask
 from wildgs.scene.undistort import PixelGrid, sample_mask
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.edited_photos import describe_edited
-from wildgs.sfm.lookalikes import find_doubtful
+from wildgs.sfm.lookalikes import find_doubtful, judge_pairs
 from wildgs.sfm.mapping import find_registered, quiet
 from wildgs.sfm.match_pictures import FOLDER as PICTURES
 from wildgs.sfm.match_pictures import write_match_pictures
@@ -102,6 +102,7 @@ def _reconstruct(
         _write_scene(work, copies, model)
         without = failures(work, copies, poses.models, poses.findings)
         names = {copy.work_name: copy.scene_name for copy in copies}
+        judged = judge_pairs(model, work.database)
         report = SfmReport(
             photos=len(copies) + len(broken),
             registered=tuple(sorted(c.scene_name for c in copies if find_registered(model, c) is not None)),
@@ -118,7 +119,7 @@ def _reconstruct(
             placed=placements(model, copies, poses.passes),
             copies={copies[a].name: copies[b].name for a, b in poses.findings.crops.items()},
             pictures=write_match_pictures(work, copies, without),
-            doubtful={names[n]: why for n, why in find_doubtful(model, work.database, names).items()},
+            doubtful={names[n]: why for n, why in find_doubtful(judged, names).items()},
             edited={names[n]: how for n, how in describe_edited(model).items()},
         )
         report.write(work.scene)

@@ -15,7 +15,7 @@ from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.guided_matching import GuidedMatches
 from wildgs.sfm.incremental import LEAST_GROUP, by_size
-from wildgs.sfm.lookalikes import VERIFIED, find_doubtful, keeps_agreement
+from wildgs.sfm.lookalikes import LEAST_MATCHES, VERIFIED, find_doubtful, judge_pairs, keeps_agreement
 from wildgs.sfm.mapping import (
     continue_mapping,
     lenses_of,
@@ -241,8 +241,9 @@ def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> 
     architecture, like the sides of an octagonal tower, gives points scattered over many photos.
     """
     names = {name: name for name in names_of(model)}
-    doubtful = find_doubtful(model, work.database, names)
-    outweighed = find_doubtful(model, work.database, names, VERIFIED)
+    pairs = judge_pairs(model, work.database, VERIFIED)
+    outweighed = find_doubtful(pairs, names)
+    doubtful = find_doubtful([pair for pair in pairs if pair.matches >= LEAST_MATCHES], names)
     for image_id in list(model.reg_image_ids()):
         image, neighbours = model.image(image_id), count_neighbours(model, model.image(image_id))
         contradicted, alone = image.name in doubtful, not neighbours
