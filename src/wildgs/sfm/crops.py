@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import closing
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, Integer
 
+from wildgs.sfm.database import open_database
 from wildgs.sfm.pairs import Pair
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -33,7 +32,7 @@ def find_crops(work: Workplace, copies: Sequence[WorkingCopy], pairs: Iterable[P
         pairs: Pairs to check.
     """
     original: dict[int, int] = {}
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         for a, b in sorted(pairs):
             first, second = ids.get(copies[a].work_name), ids.get(copies[b].work_name)

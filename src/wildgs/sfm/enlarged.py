@@ -18,6 +18,7 @@ from jaxtyping import Float32
 from PIL import Image
 
 from wildgs.scene.images import read_photo
+from wildgs.sfm.database import open_database
 from wildgs.sfm.matching import forget_pairs, image_ids
 from wildgs.sfm.pairs import Pair
 from wildgs.sfm.upright import WorkingCopy
@@ -43,7 +44,7 @@ def enlarge_small(
     Returns:
         The photos with new features.
     """
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
         known = {row: i for row, i in enumerate(ids) if row in photos and i is not None}
         small = {row: i for row, i in known.items() if _long_side(database, i) <= SMALL_SIDE}
@@ -56,7 +57,7 @@ def enlarge_small(
     with closing(sqlite3.connect(work.database)) as opened, opened:
         for table in ("keypoints", "descriptors"):
             opened.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(i,) for i in small.values()])
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         for row, image_id in small.items():
             keypoints, descriptors = _features(work, copies[row], max_features)
             database.write_keypoints(image_id, keypoints)

@@ -6,7 +6,6 @@ Source: Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from contextlib import closing
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import pycolmap
 
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.database import open_database
 from wildgs.sfm.lens_priors import (
     ROBUST_SCALE,
     TOLERANCE,
@@ -105,7 +105,7 @@ def run_pipeline(
     priors = _priors(work) if count <= PRIORS_LIMIT else {}
     options.image_path = work.images
     options.ba_refine_focal_length = options.ba_refine_extra_params = not priors
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, manager)
     adjusted: dict[int, int] = {}
 
@@ -198,7 +198,7 @@ def _finish(
 
 
 def _priors(work: Workplace) -> dict[int, LensPrior]:
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         return {camera.camera_id: LensPrior.of(camera) for camera in database.read_all_cameras()}
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Shaped
 
+from wildgs.sfm.database import open_database
 from wildgs.sfm.lookalikes import verified_matches
 
 LEAST_MATCHES = 15
@@ -49,7 +49,7 @@ def initial_pairs(
     Yields:
         Ids of two images.
     """
-    with closing(pycolmap.Database.open(database_file)) as database:
+    with open_database(database_file) as database:
         images = database.read_all_images()
     photos = [image.image_id for image in images if not names or image.name in names]
     matches = dict(verified_matches(photos, database_file, LEAST_MATCHES))
@@ -59,7 +59,7 @@ def initial_pairs(
     strongest = sorted(matches, key=lambda pair: len(matches[pair]), reverse=True)[:CANDIDATES]
     seen = {pair: count_seen(neighbours, *pair) for pair in strongest}
     for pair in sorted(strongest, key=lambda pair: seen[pair], reverse=True):
-        with closing(pycolmap.Database.open(database_file)) as database:
+        with open_database(database_file) as database:
             angle = _angle(database, pair, matches[pair], seed)
         if angle >= LEAST_ANGLE:
             yield pair

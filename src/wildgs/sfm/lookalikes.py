@@ -9,7 +9,6 @@ visual relations using loop constraints", CVPR 2010.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float64, Shaped
+
+from wildgs.sfm.database import open_database
 
 LEAST_MATCHES = 30
 """Smallest number of matches of a pair to be considered; fewer are often wrong by chance."""
@@ -134,7 +135,7 @@ def verified_matches(
         The ids of two images, the smaller one first, and indices of their features.
     """
     wanted = set(photos)
-    with closing(pycolmap.Database.open(database_file)) as database:
+    with open_database(database_file) as database:
         for pair_id, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
             pair = pycolmap.pair_id_to_image_pair(pair_id)
             if inliers >= least and wanted.issuperset(pair):

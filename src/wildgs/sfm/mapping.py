@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 import pycolmap
 
 from wildgs.progress import Progress
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.database import open_database
 from wildgs.sfm.edited_photos import with_square_pixels
 from wildgs.sfm.incremental import is_wide, pipeline_options, run_pipeline
 from wildgs.sfm.initial_pairs import LEAST_ANGLE, LEAST_MATCHES
@@ -114,7 +115,7 @@ def _expect_few_inliers(options: Any) -> None:
 
 def lenses_of(work: Workplace, names: Collection[str]) -> set[int]:
     """Ids of the cameras of working copies."""
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         return {image.camera_id for image in database.read_all_images() if image.name in names}
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
+from wildgs.sfm.database import open_database
 from wildgs.sfm.matching import image_ids
 from wildgs.sfm.placement import Failure
 from wildgs.sfm.upright import WorkingCopy
@@ -34,7 +33,7 @@ def write_match_pictures(
     """
     rows = {copy.name: row for row, copy in enumerate(copies)}
     pictures = {}
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
         for name, failure in failures.items():
             if failure.partner is None or len(pictures) == MAX_PICTURES:

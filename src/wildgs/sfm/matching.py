@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from wildgs.progress import Progress
 from wildgs.scene.images import DECODING_PIXELS, open_image
 from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.crops import CANDIDATE_LIKENESS, find_crops
+from wildgs.sfm.database import open_database
 from wildgs.sfm.pairs import Pair, Pairing, alike_pairs, choose_pairs, vlad_descriptors
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.watermarks import remove_captions
@@ -84,7 +84,7 @@ def _batches(work: Workplace, names: Sequence[str]) -> Iterator[list[str]]:
 
 def describe_photos(work: Workplace, copies: Sequence[WorkingCopy], seed: int) -> Float[Tensor, "N D"]:
     """A unit vector per photo for retrieval."""
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
 
         def descriptors(photo: int) -> np.ndarray:
@@ -148,7 +148,7 @@ def match(
 
 def _feature_counts(work: Workplace, copies: Sequence[WorkingCopy]) -> list[int]:
     """Number of features of each photo; 0 for photos that COLMAP could not read."""
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
         return [0 if known is None else database.num_keypoints_for_image(known) for known in ids]
 
@@ -202,7 +202,7 @@ def match_pairs(
             verification_options=verification,
         )
         if not keep_stationary:
-            with closing(pycolmap.Database.open(work.database)) as database:
+            with open_database(work.database) as database:
                 ids = image_ids(database, copies)
                 known = [(ids[a], ids[b]) for a, b in chunk]
                 remove_captions(database, [(a, b) for a, b in known if a and b], verification)
@@ -236,7 +236,7 @@ def chunks_of_pairs(pairs: Sequence[Pair], features: Sequence[int], most: int) -
 
 def forget_pairs(work: Workplace, copies: Sequence[WorkingCopy], pairs: Collection[Pair]) -> None:
     """Deletes the matches of pairs, so that they can be matched again."""
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
         for a, b in pairs:
             first, second = ids[a], ids[b]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 
+from wildgs.sfm.database import open_database
 from wildgs.sfm.incremental import LEAST_GROUP
 from wildgs.sfm.mapping import find_registered, missing_from
 from wildgs.sfm.matching import image_ids, verified_pairs
@@ -113,7 +112,7 @@ def failures(
     work: Workplace, copies: Sequence[WorkingCopy], models: Sequence[Any], findings: Findings
 ) -> dict[str, Failure]:
     """Reasons why photos have no pose in the first model, by name."""
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
         found = verified_pairs(database, copies)
         blank = {row for row, i in enumerate(ids) if i is None or database.num_keypoints_for_image(i) == 0}

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from wildgs.progress import Counter
 from wildgs.sfm.consistent_matching import Features, Shapes, find_consistent_pose
+from wildgs.sfm.database import open_database
 from wildgs.sfm.feature_index import FeatureIndex, nearest_points, select_matches
 from wildgs.sfm.localization import MIN_INLIERS, solve_pose
 from wildgs.sfm.mapping import find_registered, missing_from
@@ -61,7 +61,7 @@ def match_to_points(
     """
     missing = [row for row in missing_from(model, copies) if only is None or copies[row].work_name in only]
     found = []
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         ids = image_ids(database, copies)
         placed = [row for row, copy in enumerate(copies) if find_registered(model, copy) is not None]
         observed = [_observed(database, model, find_registered(model, copies[row])) for row in placed]

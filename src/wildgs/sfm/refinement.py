@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ import pycolmap
 from wildgs.progress import Counter as Progressed
 from wildgs.progress import Progress, counter
 from wildgs.sfm.config import CONFIRMED, SfmConfig
+from wildgs.sfm.database import open_database
 from wildgs.sfm.edited_photos import fit_edited, has_edited
 from wildgs.sfm.guided_matching import GuidedMatches, Matches, match_guided, neighbours
 from wildgs.sfm.incremental import MAX_ERROR, MIN_ANGLE, adjust_robustly, pipeline_options
@@ -153,7 +153,7 @@ def with_guided_matches(
     few = model.num_reg_images() <= GUIDED_LIMIT
     nearest = neighbours(model, NEIGHBOURS, LEAST_SHARED) if few else []
     pairs = [pair for pair in nearest if pair not in guided]
-    with closing(pycolmap.Database.open(work.database)) as database:
+    with open_database(work.database) as database:
         guided.update(match_guided(model, database, pairs, REACH, progress))
     registered = set(model.reg_image_ids())
     found = dict(verified)

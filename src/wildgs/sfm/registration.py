@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence, Set
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import pycolmap
 from jaxtyping import Float
 from torch import Tensor
 
 from wildgs.progress import Progress, counter
 from wildgs.sfm.config import SfmConfig
+from wildgs.sfm.database import open_database
 from wildgs.sfm.guided_matching import GuidedMatches
 from wildgs.sfm.incremental import LEAST_GROUP, by_size
 from wildgs.sfm.lookalikes import LEAST_MATCHES, VERIFIED, find_doubtful, judge_pairs, keeps_agreement
@@ -145,7 +144,7 @@ class Registration:
         rest = self.missing(main)
         if len(rest) < LEAST_GROUP:
             return []
-        with closing(pycolmap.Database.open(self.work.database)) as database:
+        with open_database(self.work.database) as database:
             groups = find_groups(rest, verified_pairs(database, self.copies))
         largest = max(groups.values(), key=len)
         if len(largest) > main.num_reg_images():
@@ -212,7 +211,7 @@ class Registration:
         missing = set(self.missing(models[0]) if models else kept) - self.crops
         by_points = {photo for photo in kept if self.copies[photo].work_name in self.passes}
         again = set(kept) - by_points if len(self.copies) <= AGAIN_LIMIT else missing
-        with closing(pycolmap.Database.open(self.work.database)) as database:
+        with open_database(self.work.database) as database:
             matched = verified_pairs(database, self.copies)
         count = self.config.pairing.neighbours
         wanted = {row: count for row, photo in enumerate(kept) if photo in again}

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pycolmap
 from jaxtyping import Bool, Float64, Int64
 
 from wildgs.sfm.config import CONFIRMED
 from wildgs.sfm.consistent_matching import Shapes
+from wildgs.sfm.database import open_database
 from wildgs.sfm.workplace import Workplace
 
 FEATURE_SCALE = 2.0
@@ -101,7 +100,7 @@ class _Seen:
             np.zeros((count, 3)),
             np.zeros((count, 2, 3)),
         )
-        with closing(pycolmap.Database.open(work.database)) as database:
+        with open_database(work.database) as database:
             for photo, rows in rows_by_photo(photos):
                 image = model.image(photo)
                 seen.pixels[rows] = [image.point2D(feature).xy for feature in features[rows]]
