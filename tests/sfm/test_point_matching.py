@@ -76,6 +76,19 @@ def test_photos_that_only_match_each_other_are_named_as_a_group(
     assert other_places(reasons.values()) == (tuple(f"{number}.jpg" for number in range(6)),)
 
 
+def test_photos_that_their_matches_contradict_are_told_from_those_without_matches(
+    matched: tuple[Workplace, list[WorkingCopy]],
+) -> None:
+    work, copies = matched
+    model = map_photos(
+        work, len(copies), SfmConfig(), silent, only=[copy.work_name for copy in copies[:LOST]]
+    )[0]
+    lost = Findings(contradicted={copies[LOST].work_name: "9 of its 10 matches", copies[0].work_name: "some"})
+    without = failures(work, copies, [model], lost)
+    assert list(without) == [f"{LOST}.jpg"], "a photo that has another pose is not left out"
+    assert without[f"{LOST}.jpg"].reason.startswith("lost its pose: 9 of its 10 matches; places or sides")
+
+
 def test_lines_end_where_the_matches_are() -> None:
     photos = [Image.new("RGB", (640, 320)), Image.new("RGB", (160, 320))]
     picture = np.asarray(draw_matches(photos, [np.array([[100.0, 200.0]]), np.array([[80.0, 40.0]])]))

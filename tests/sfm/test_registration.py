@@ -1,6 +1,3 @@
-from pathlib import Path
-
-import numpy as np
 import pycolmap
 import pytest
 
@@ -8,30 +5,16 @@ from tests.sfm.conftest import LOST
 from wildgs.progress import silent
 from wildgs.sfm import registration as registration_module
 from wildgs.sfm.config import SfmConfig
-from wildgs.sfm.incremental import LEAST_GROUP
-from wildgs.sfm.lookalikes import LEAST_MATCHES
 from wildgs.sfm.mapping import find_registered, map_photos, missing_from
 from wildgs.sfm.matching import describe_photos
 from wildgs.sfm.pairs import Pair
-from wildgs.sfm.placement import NEIGHBOUR_POINTS, PassName, count_neighbours
-from wildgs.sfm.registration import FEW_NEIGHBOURS, Registration, drop_unsure, names_of
+from wildgs.sfm.registration import Registration
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
 
 def registration(work: Workplace, copies: list[WorkingCopy]) -> Registration:
     return Registration(work, copies, describe_photos(work, copies, 0), SfmConfig(), silent)
-
-
-def synthesized(folder: Path) -> tuple[Workplace, pycolmap.Reconstruction]:
-    """A workplace and the model of ten generated photos."""
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig = 10, 1
-    work = Workplace(folder)
-    with pycolmap.Database.open(work.database) as database:
-        model = pycolmap.synthesize_dataset(options, database)
-    return work, model
 
 
 def test_a_photo_with_an_implausible_lens_is_placed_with_a_plain_one(
@@ -57,79 +40,6 @@ def test_other_photos_are_not_tried(matched: tuple[Workplace, list[WorkingCopy]]
     rest = [copy.work_name for copy in copies[:LOST]]
     model = map_photos(work, len(copies), SfmConfig(), silent, only=rest)[0]
     assert registration(work, copies).place_with_plain_lens(model, {"no.jpg"}) is model
-
-
-def test_late_photos_without_a_neighbour_are_dropped(tmp_path: Path) -> None:
-    work, model = synthesized(tmp_path)
-    first, lonely, late = (model.image(i) for i in model.reg_image_ids()[:3])
-    for image in (first, lonely):  # a few points are left, each seen by other photos
-        rows = image.get_observation_point2D_idxs()
-        for row in rows[NEIGHBOUR_POINTS - 1 :]:
-            model.delete_observation(image.image_id, row)
-        assert count_neighbours(model, image) == 0
-    assert count_neighbours(model, late) > 0
-    drop_unsure(model, work, {lonely.name: "third", late.name: "second"})
-    registered = {model.image(i).name for i in model.reg_image_ids()}
-    assert lonely.name not in registered
-    assert {first.name, late.name} <= registered, "photos of the first pass are kept"
-
-
-@pytest.mark.parametrize("alone", [True, False])
-@pytest.mark.parametrize("wrong", [True, False])
-def test_photos_of_the_first_pass_are_dropped_if_nothing_supports_them(
-    tmp_path: Path, alone: bool, wrong: bool
-) -> None:
-    """Their matches contradict them, and they share hardly any point; one of both is not enough."""
-    work, model = synthesized(tmp_path)
-    image = model.image(model.reg_image_ids()[0])
-    if alone:
-        for row in image.get_observation_point2D_idxs()[NEIGHBOUR_POINTS - 1 :]:
-            model.delete_observation(image.image_id, row)
-    if wrong:
-        turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0.4, -0.3, 0.5]), [0.5, 0.2, 0.1])
-        image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
-    drop_unsure(model, work, {})
-    dropped = image.name not in {model.image(number).name for number in model.reg_image_ids()}
-    assert dropped == (alone and wrong)
-
-
-@pytest.mark.parametrize("photos", [FEW_NEIGHBOURS, FEW_NEIGHBOURS + 1])
-@pytest.mark.parametrize("wrong", [True, False])
-@pytest.mark.parametrize("passes", ["first", "second"])
-def test_pairs_with_few_matches_count_against_photos_with_few_neighbours(
-    tmp_path: Path, photos: int, wrong: bool, passes: PassName
-) -> None:
-    """A look-alike shares points with some photos, and no pair of it has many matches."""
-    work, model = synthesized(tmp_path)
-    for number in model.reg_image_ids()[photos:]:
-        model.deregister_frame(model.image(number).frame_id)
-    image = model.image(model.reg_image_ids()[0])
-    assert count_neighbours(model, image) == photos - 1
-    with pycolmap.Database.open(work.database) as database:
-        for number in model.reg_image_ids()[1:]:
-            geometry = database.read_two_view_geometry(image.image_id, number)
-            geometry.inlier_matches = geometry.inlier_matches[: LEAST_MATCHES - 1]
-            database.update_two_view_geometry(image.image_id, number, geometry)
-    if wrong:
-        turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0.4, -0.3, 0.5]), [0.5, 0.2, 0.1])
-        image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
-    before = names_of(model)
-    drop_unsure(model, work, {} if passes == "first" else {image.name: passes})
-    few = photos - 1 < FEW_NEIGHBOURS
-    assert before - names_of(model) == ({image.name} if wrong and few else set())
-
-
-def test_three_photos_are_left_of_a_model_that_its_matches_contradict(tmp_path: Path) -> None:
-    work, model = synthesized(tmp_path)
-    for number in model.reg_image_ids()[FEW_NEIGHBOURS:]:
-        model.deregister_frame(model.image(number).frame_id)
-    rng = np.random.default_rng(0)
-    for number in model.reg_image_ids():
-        image = model.image(number)
-        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(rng.normal(0.0, 0.5, 3)), rng.normal(0.0, 0.5, 3))
-        image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
-    drop_unsure(model, work, {})
-    assert model.num_reg_images() == LEAST_GROUP
 
 
 def test_a_larger_group_left_out_gets_all_passes(matched: tuple[Workplace, list[WorkingCopy]]) -> None:

@@ -140,3 +140,8 @@ def find_registered(model: Any, copy: WorkingCopy) -> Any | None:
 def missing_from(model: Any, copies: Sequence[WorkingCopy]) -> list[int]:
     """The photos without a pose in a model."""
     return [row for row, copy in enumerate(copies) if find_registered(model, copy) is None]
+
+
+def names_of(model: Any) -> set[str]:
+    """Names of the registered working copies."""
+    return {model.image(image_id).name for image_id in model.reg_image_ids()}

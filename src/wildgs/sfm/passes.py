@@ -11,11 +11,11 @@ from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.enlarged import enlarge_small
 from wildgs.sfm.incremental import measure_distortion
 from wildgs.sfm.lenses import drop_impossible
-from wildgs.sfm.mapping import missing_from
+from wildgs.sfm.mapping import missing_from, names_of
 from wildgs.sfm.matching import describe_photos, extract, match
 from wildgs.sfm.pairs import Pairing
 from wildgs.sfm.placement import Findings, PassName
-from wildgs.sfm.registration import Registration, names_of
+from wildgs.sfm.registration import Registration
 from wildgs.sfm.repeated_mapping import map_repeatedly
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
@@ -68,7 +68,7 @@ def find_poses(
         models[0] = photos.place_with_plain_lens(models[0], set(lenses))
         lenses |= drop_impossible(models[0])
         lenses = {name: why for name, why in lenses.items() if name not in names_of(models[0])}
-    return Poses(models, pairing, photos.passes, Findings(crops, lenses))
+    return Poses(models, pairing, photos.passes, Findings(crops, lenses, photos.contradicted))
 
 
 def _enlarge_missing(photos: Registration, model: Any) -> None:

@@ -25,6 +25,8 @@ NEIGHBOUR_POINTS = 15
 GROUP_MATCHES = 30
 """Smallest number of matches between photos without a pose that show the same thing."""
 
+LOOKALIKES = "places or sides that look alike were taken for one another; photos taken in between would help"
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -102,10 +104,12 @@ class Findings:
     Attributes:
         crops: Originals of copies and crops, as indices of photos.
         lenses: Problems of lenses, by name of the working copy.
+        contradicted: Why photos lost their pose, if their matches contradict it, by name of the working copy.
     """
 
     crops: Mapping[int, int] = field(default_factory=dict)
     lenses: Mapping[str, str] = field(default_factory=dict)
+    contradicted: Mapping[str, str] = field(default_factory=dict)
 
 
 def failures(
@@ -132,6 +136,8 @@ def failures(
         group: tuple[str, ...] = ()
         if reason is None and len(groups[row]) >= LEAST_GROUP:
             group = tuple(sorted(copies[member].name for member in groups[row]))
+        if reason is None and copies[row].work_name in findings.contradicted:
+            reason = f"lost its pose: {findings.contradicted[copies[row].work_name]}; {LOOKALIKES}"
         reason = reason or _reason(copies[row], copies[partner], models[0], group, inliers)
         result[copies[row].name] = Failure(reason, copies[partner].name if inliers else None, group)
     return result

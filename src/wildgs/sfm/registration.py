@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence, Set
+from collections.abc import Collection, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,19 +14,21 @@ from wildgs.sfm.config import SfmConfig
 from wildgs.sfm.database import open_database
 from wildgs.sfm.guided_matching import GuidedMatches
 from wildgs.sfm.incremental import LEAST_GROUP, by_size
-from wildgs.sfm.lookalikes import LEAST_MATCHES, VERIFIED, find_doubtful, judge_pairs, keeps_agreement
+from wildgs.sfm.lookalikes import keeps_agreement
 from wildgs.sfm.mapping import (
     continue_mapping,
     lenses_of,
     map_photos,
     missing_from,
+    names_of,
 )
 from wildgs.sfm.matching import forget_pairs, match_pairs, verified_pairs
 from wildgs.sfm.pairs import Pair, alike_pairs, friends_of_friends
-from wildgs.sfm.placement import PassName, count_neighbours, find_groups
+from wildgs.sfm.placement import PassName, find_groups
 from wildgs.sfm.point_matching import match_to_points
 from wildgs.sfm.refinement import refine
 from wildgs.sfm.repeated_mapping import is_better, map_repeatedly
+from wildgs.sfm.unsure_poses import drop_unsure
 from wildgs.sfm.upright import WorkingCopy
 from wildgs.sfm.workplace import Workplace
 
@@ -40,20 +42,12 @@ AGAIN_LIMIT = 40
 """Number of photos up to which all of them are matched and mapped again if some have no pose. Of 20 photos of
 `gate`, 17 have a pose then instead of 15, and of another choice 10 instead of 4."""
 
-LEAST_POINTS = 10
-"""Smallest number of sparse points of a photo registered by a later pass."""
-
-FEW_NEIGHBOURS = 5
-"""Number of neighbours below which pairs with few matches count against a pose, too. Of 35 photos of a generated
-landmark, three had poses 88 to 120 degrees off, by matches between sides of the building that look alike. They had
-0 to 4 neighbours and more matches against than for them; no other photo had both."""
-
 
 @dataclass
 class Registration:
     """Photos of a collection whose features are matched, and what the later passes found.
 
-    Models are never modified, except by `drop_unsure`.
+    Models are never modified, except that photos with unsure poses are removed.
 
     Attributes:
         work: The workplace, whose database contains features and matches.
@@ -63,6 +57,8 @@ class Registration:
         progress: Called during matching and mapping.
         crops: Photos that are crops of others; these are not matched again.
         passes: The pass that registered a photo, if not the first, by name of its working copy.
+        contradicted: Why photos lost their pose, by name of the working copy, if their matches contradict it. Some
+            of them may have another one now.
         guided: Guided matches, kept from one refinement to the next.
     """
 
@@ -73,6 +69,7 @@ class Registration:
     progress: Progress
     crops: Set[int] = frozenset()
     passes: dict[str, PassName] = field(default_factory=dict)
+    contradicted: dict[str, str] = field(default_factory=dict)
     guided: GuidedMatches = field(default_factory=dict)
 
     def try_again(self, models: list[Any]) -> tuple[list[Any], set[Pair]]:
@@ -82,7 +79,7 @@ class Registration:
             All models, and the pairs that were matched again.
         """
         if models:
-            drop_unsure(models[0], self.work, self.passes)
+            self._drop_unsure(models[0])
             models = [self._place_by_points(models[0], "second"), *models[1:]]
             if not self.missing(models[0]):
                 return models[:1], set()
@@ -109,11 +106,11 @@ class Registration:
         """The refined model, with photos that only its points, of which there are more, give a pose."""
         refined = self._refined(model)
         if self.config.second_chance:
-            drop_unsure(refined, self.work, self.passes)
+            self._drop_unsure(refined)
         if not self.config.second_chance or not self.missing(refined):
             return refined
         grown = self._place_by_points(refined, "second")
-        drop_unsure(grown, self.work, self.passes)
+        self._drop_unsure(grown)
         return self._refined(grown) if names_of(grown) - names_of(refined) else refined
 
     def place_with_plain_lens(self, model: Any, names: Collection[str]) -> Any:
@@ -132,7 +129,7 @@ class Registration:
         if not match_to_points(self.work, self.copies, self.vlads, model, self.config.seed, show, only=names):
             return model
         after = self._continue(model, "second", names)
-        drop_unsure(after, self.work, self.passes)
+        self._drop_unsure(after)
         return self._refined(after, lenses_of(self.work, names))
 
     def map_rest(self, main: Any) -> list[Any]:
@@ -160,6 +157,10 @@ class Registration:
         """The photos without a pose in a model."""
         return missing_from(model, self.copies)
 
+    def _drop_unsure(self, model: Any) -> None:
+        names = {copy.work_name: copy.name for copy in self.copies}
+        self.contradicted |= drop_unsure(model, self.work, self.passes, names)
+
     def _map_again(self, models: list[Any]) -> list[Any]:
         """Models by all matches, of which there are more now, if the largest one is better."""
         again = map_repeatedly(self.work, self.copies, self.config, self.progress)
@@ -171,7 +172,7 @@ class Registration:
     def _third_pass(self, model: Any) -> Any:
         """Registers photos with fewer inliers, matches others to the points again, and drops unsure ones."""
         main = self._place_by_points(self._continue(model, "third"), "third")
-        drop_unsure(main, self.work, self.passes)
+        self._drop_unsure(main)
         return main
 
     def _place_by_points(self, model: Any, name: PassName) -> Any:
@@ -224,33 +225,3 @@ class Registration:
             and matched.get(pair, 0) < ENOUGH_MATCHES
             and (set(pair) & missing or not set(pair) & by_points)
         }
-
-
-def names_of(model: Any) -> set[str]:
-    """Names of the registered working copies."""
-    return {model.image(image_id).name for image_id in model.reg_image_ids()}
-
-
-def drop_unsure(model: Any, work: Workplace, passes: Mapping[str, PassName]) -> None:
-    """Removes photos whose poses are not reliable.
-
-    Those registered by a later pass have too few points, are contradicted by most of their matches, or share few
-    points with every other photo; of the first pass, both of the latter. Photos with few neighbours are removed if
-    most of their matches contradict them when pairs with few matches count as well, except the last three. Repeated
-    architecture, like the sides of an octagonal tower, gives points scattered over many photos.
-    """
-    names = {name: name for name in names_of(model)}
-    pairs = judge_pairs(model, work.database, VERIFIED)
-    outweighed = find_doubtful(pairs, names)
-    doubtful = find_doubtful([pair for pair in pairs if pair.matches >= LEAST_MATCHES], names)
-    for image_id in list(model.reg_image_ids()):
-        image, neighbours = model.image(image_id), count_neighbours(model, model.image(image_id))
-        contradicted, alone = image.name in doubtful, not neighbours
-        if neighbours < FEW_NEIGHBOURS and image.name in outweighed and model.num_reg_images() > LEAST_GROUP:
-            unsure = True
-        elif image.name in passes:
-            unsure = contradicted or alone or image.num_points3D < LEAST_POINTS
-        else:
-            unsure = contradicted and alone
-        if unsure:
-            model.deregister_frame(image.frame_id)
