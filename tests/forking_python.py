@@ -76,8 +76,10 @@ def serve(folder: Path) -> None:
     client.with_suffix(".part").write_text(CLIENT)
     client.with_suffix(".part").chmod(0o755)
     client.with_suffix(".part").rename(client)
-    while True:
-        for process in (folder / "requests").read_text().split():
+    # Open for writing, too, so that it never ends: what a client wrote between the end and closing would be lost.
+    with os.fdopen(os.open(folder / "requests", os.O_RDWR)) as requests:
+        for line in requests:
+            process = line.strip()
             if os.fork() == 0:
                 code = child(folder, process)
                 for stream in (sys.stdout, sys.stderr):
