@@ -32,6 +32,7 @@ EARLIER_DEFAULTS: dict[tuple[str, ...], tuple[str, Any]] = {
     ("train", "schedule", "mask_visits"): ("mask_pause", 0),
     ("train", "dropout"): ("density", {"rate": 0.0}),
     ("train", "flat_ground"): ("density", {"rate": 0.0}),
+    ("train", "flat_ground", "level"): ("rate", False),
     ("train", "warp"): ("density", {"rate": 0.0, "residuals": False}),
     ("train", "warp", "residuals"): ("rate", False),
     ("train", "density", "strategy"): ("split_scale", "classic"),

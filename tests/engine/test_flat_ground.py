@@ -1,4 +1,4 @@
-"""The ground that few photos show: moved onto its plane, and nothing else is."""
+"""Ground that few photos show, or that is known to be level: moved onto its plane, and nothing else is."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from wildgs.model.registry import MethodName, create_method
 from wildgs.model.wildgs import WildGSConfig
 from wildgs.scene import Scene
 
-CONFIG = FlatGroundConfig(rate=0.05, photos=12, height=0.5)
+CONFIG = FlatGroundConfig(rate=0.05, photos=12, height=0.5, level=False)
+LEVEL = replace(CONFIG, level=True)
 EYES = HIGHEST_EYES
 """The height that counts of cameras that are higher."""
 
@@ -102,6 +103,59 @@ def test_only_what_few_photos_show_near_ground_and_cameras_moves(
     assert torch.equal(method.gaussians.means[len(places) :], before["means"][len(places) :])
     for name in before.keys() - {"means", "log_scales"}:
         assert torch.equal(method.gaussians.rows[name], before[name]), name
+
+
+def with_steps(wall_scene: Scene, height: float) -> Scene:
+    """Right of x = 0.3, sparse points are at a height of a step, relative to that of the cameras."""
+    scene = seen_from_above(wall_scene, EYES)
+    points = scene.points.clone()
+    points[points[:, 0] > 0.3, 2] = height * EYES
+    return replace(scene, points=points)
+
+
+@pytest.mark.parametrize(
+    ("height", "moves"), [(0.0, True), (0.05, True), (0.2, False), (0.6, False), (-0.2, False), (1.5, True)]
+)
+def test_what_many_photos_show_moves_where_the_nearest_sparse_points_are_on_the_plane(
+    wall_scene: Scene, tiny_model: WildGSConfig, height: float, moves: bool
+) -> None:
+    scene, low = with_steps(wall_scene, height), 0.4 * EYES
+    method = method_for(scene, tiny_model)
+    ground = FlatGround(method, scene, LEVEL)
+    place(method, [(-0.5, 0, low), (0.7, 0, low), (0.7, 0, low)], [100, 100, 1])
+    ground.update(EVERY, 1)
+    stays = (1 - LEVEL.rate) ** EVERY
+    heights = (method.gaussians.means[:3, 2] / low).tolist()
+    # A wall of points above the eyes says nothing about what is below them: the nearest others do.
+    assert heights == pytest.approx([stays, stays if moves else 1.0, stays], abs=0.1)
+
+
+def test_level_ground_is_flat_before_photos_are_counted(wall_scene: Scene, tiny_model: WildGSConfig) -> None:
+    scene, low = with_steps(wall_scene, 0.2), 0.4 * EYES
+    method = method_for(scene, tiny_model)
+    place(method, [(-0.5, 0, low), (0.7, 0, low)], [100, 1])
+    method.gaussians.photos = None
+    FlatGround(method, scene, LEVEL).update(EVERY, 1)
+    heights = (method.gaussians.means[:2, 2] / low).tolist()
+    assert heights == pytest.approx([(1 - LEVEL.rate) ** EVERY, 1.0], abs=0.1)
+
+
+@pytest.mark.parametrize("known", [0, 2, 20])
+def test_ground_of_depth_maps_alone_is_not_known_to_be_level(
+    paving: Scene, tiny_model: WildGSConfig, monkeypatch: pytest.MonkeyPatch, known: int
+) -> None:
+    """The few sparse points are a step, if there are any."""
+    steps = paving.points[:known] + torch.tensor([0.0, 0.0, 0.2 * EYES])
+    scene = replace(paving, points=steps, point_colors=paving.point_colors[:known])
+    dense = (paving.points, torch.zeros(len(paving.points), 3, dtype=torch.uint8))
+    monkeypatch.setattr(flat_ground, "depth_points", lambda *_: dense)
+    method, low = method_for(paving, tiny_model), 0.4 * EYES
+    ground = FlatGround(method, scene, LEVEL)
+    assert ground.is_used
+    place(method, [(0, 0, low), (0, 0, low)], [100, 1])
+    ground.update(EVERY, 1)
+    heights = (method.gaussians.means[:2, 2] / low).tolist()
+    assert heights == pytest.approx([1.0, (1 - LEVEL.rate) ** EVERY], abs=0.1)
 
 
 def test_the_ground_of_depth_maps_counts_where_sfm_found_none(

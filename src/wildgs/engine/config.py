@@ -142,18 +142,21 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class FlatGroundConfig:
-    """Gaussians that few photos show are kept on the ground plane (`wildgs.engine.flat_ground`). Not in the paper.
+    """Gaussians near the ground are kept on its plane (`wildgs.engine.flat_ground`). Not in the paper.
 
     Attributes:
         rate: Fraction of its distance from the ground plane that a Gaussian moves towards it per step if at most a
-            quarter of --flat-ground.photos show it. 0 = off.
-        photos: Gaussians that this many training photos show are not moved; the rate falls linearly up to it.
+            quarter of --flat-ground.photos show it, or if the ground is known to be level there. 0 = off.
+        photos: Gaussians that this many training photos show are not moved where the ground is not known to be
+            level; the rate falls linearly up to it.
+        level: Move all Gaussians near the ground where most of the nearest sparse points are on its plane.
         height: Largest height above the plane of Gaussians that are moved, relative to that of the lowest quarter
             of the cameras (at most 0.12 median depths).
     """
 
     rate: float = 0.02
     photos: int = 12
+    level: bool = True
     height: float = 0.25
 
 
@@ -198,7 +201,7 @@ class TrainConfig:
         optimizer: Learning rates of the geometry.
         density: Densification and pruning.
         dropout: Dropout of Gaussians, for scenes of few photos.
-        flat_ground: Ground that few photos show is kept flat.
+        flat_ground: The ground is kept flat.
         warp: Training photos are displaced to where they fit their renders.
     """
 
