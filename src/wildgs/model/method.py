@@ -42,7 +42,7 @@ class Method(nn.Module, ABC):
         local_size: Length of the local embeddings; 0 for a method without them.
         mask_threshold: Threshold Th: pixels with a higher visibility are static.
         masks_become_final: Whether masks are fixed once their decoder is no longer trained.
-        flattens_ground: Whether Gaussians near the ground that few photos show are kept on its plane in training.
+        flattens_ground: Whether Gaussians near the ground are kept on its plane in training.
         warps_photos: Whether training photos are displaced to where they fit their renders.
         uses_dropout: Whether Gaussians that few photos show are dropped in training (`Stage.dropout`).
         depth_supervised: Whether the depth loss applies to this method.
