@@ -146,10 +146,11 @@ class FlatGroundConfig:
 
     Attributes:
         rate: Fraction of its distance from the ground plane that a Gaussian moves towards it per step if at most a
-            quarter of --flat-ground.photos show it, or if the ground is known to be level there. 0 = off.
+            quarter of --flat-ground.photos show it. 0 = off.
         photos: Gaussians that this many training photos show are not moved where the ground is not known to be
             level; the rate falls linearly up to it.
-        level: Move all Gaussians near the ground where most of the nearest sparse points are on its plane.
+        level: Move all Gaussians near the ground where most of the nearest sparse points are on its plane, those
+            that many photos show at a fifth of the rate.
         height: Largest height above the plane of Gaussians that are moved, relative to that of the lowest quarter
             of the cameras (at most 0.12 median depths).
     """

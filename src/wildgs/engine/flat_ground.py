@@ -45,6 +45,9 @@ HIGHEST_EYES = 0.12
 NEAREST, ON_PLANE = 3, 0.08
 """Number of the sparse points below the eyes that are nearest to a place, most of which have to be on the plane for
 all Gaussians there to be moved, and how far from it they may be, relative to the same height. A step has 0.09."""
+LEVEL_PULL = 0.2
+"""How far a Gaussian that many photos show is moved there, relative to one that few photos show. Squares are not
+exactly level, and photos that show them well should have their way."""
 FINE = 0.25
 """Side of the cells of the map of such places, relative to the same height."""
 THINNEST = 0.25
@@ -189,7 +192,7 @@ def _pulls(gaussians: Gaussians, ground: _Ground, photos: int) -> Float[Tensor, 
     if gaussians.photos is not None:  # counted some steps after the start
         pulls = rareness(gaussians.photos, photos)
     if ground.level is not None:
-        pulls = pulls.masked_fill(ground.level.has(gaussians.means), 1.0)
+        pulls = torch.maximum(pulls, LEVEL_PULL * ground.level.has(gaussians.means))
     return pulls
 
 
@@ -201,7 +204,7 @@ def _flatten(gaussians: Gaussians, ground: _Ground, photos: int, share: float) -
         gaussians: Gaussians, with numbers of photos once these are known; changed in place.
         ground: The ground.
         photos: Number of photos from which a Gaussian is left alone where the ground is not known to be level.
-        share: Share of the distance by which Gaussians of the fewest photos, and of level ground, move.
+        share: Share of the distance by which Gaussians of the fewest photos move.
     """
     pulls = _pulls(gaussians, ground, photos)
     rows = (ground.is_near(gaussians.means) & (pulls > 0)).nonzero()[:, 0]
