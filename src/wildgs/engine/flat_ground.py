@@ -90,7 +90,7 @@ class _Ground:
         highest: Largest height of Gaussians above the plane.
         deepest: Largest depth of Gaussians below it, where there is hardly ever anything real.
         around: Cells within `REACH` of a camera.
-        level: Cells in which nothing but the plane is known; None if this is not asked for.
+        level: Cells whose nearest sparse points are on the plane; None if this is not asked for.
     """
 
     plane: Float[Tensor, "3"]
@@ -188,9 +188,8 @@ class FlatGround:
 
 def _pulls(gaussians: Gaussians, ground: _Ground, photos: int) -> Float[Tensor, " N"]:
     """How far Gaussians near the ground are moved, relative to those of the fewest photos."""
-    pulls = torch.zeros_like(gaussians.means[:, 2])
-    if gaussians.photos is not None:  # counted some steps after the start
-        pulls = rareness(gaussians.photos, photos)
+    counted = gaussians.photos  # None in the first steps
+    pulls = torch.zeros_like(gaussians.means[:, 2]) if counted is None else rareness(counted, photos)
     if ground.level is not None:
         pulls = torch.maximum(pulls, LEVEL_PULL * ground.level.has(gaussians.means))
     return pulls
