@@ -31,7 +31,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Workers of pytest-xdist share the cores; set before torch and the processes that tests start read it.
 if "PYTEST_XDIST_WORKER" in os.environ:
     _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
-    for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "WILDGS_NUM_THREADS"):
+    for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "WILDGS_NUM_THREADS"):
         os.environ[_name] = str(_threads)
 
 SOURCE = Path(__file__).parent.parent / "src"
@@ -64,6 +64,19 @@ def few_suns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(shadows, "_ELEVATIONS", torch.tensor([10.0, 50.0]))
     monkeypatch.setattr(shadows, "_AZIMUTHS", torch.tensor([0.0, 120.0, 240.0]))
+
+
+@pytest.fixture(autouse=True)
+def threads_stay() -> Iterator[None]:
+    """Restores torch's number of threads, which Numba's OpenMP layer (gsply, demo_generator) sets to its own.
+
+    Later tests would be several times as slow: the workers' threads would wait for each other.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.hookimpl(tryfirst=True)
