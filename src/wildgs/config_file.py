@@ -39,9 +39,12 @@ def write_config(path: Path, config: RunConfig) -> None:
         UserError: The file cannot be written.
     """
     with written_aside(path, flush=True) as aside, aside.open("w", encoding="utf-8") as file:
-        file.write(f"{_BEGIN}\n")
-        yaml.safe_dump(to_plain(config), file, sort_keys=False)
-        file.write(f"{_END}\n")
+        file.write(config_text(config))
+
+
+def config_text(config: RunConfig) -> str:
+    """The content of the file."""
+    return f"{_BEGIN}\n{yaml.safe_dump(to_plain(config), sort_keys=False)}{_END}\n"
 
 
 def read_config(path: Path) -> RunConfig:
@@ -56,17 +59,36 @@ def read_config(path: Path) -> RunConfig:
             raise UserError(
                 f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is not a run's configuration"
             )
-        text = path.read_text(encoding="utf-8")
-        if text.startswith(_BEGIN) and _END not in text.splitlines():
-            raise UserError(f"{path} is truncated: the line {_END!r} is missing; restore it from a copy")
-        plain = yaml.load(text, _Loader)
+        return parse_config(path.read_text(encoding="utf-8"), str(path))
     except FileNotFoundError as error:
         raise UserError(
             f"{path.parent} contains no run: {path.name} is missing; give another folder, or train without --resume"
         ) from error
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: an invalid date
-        raise UserError(f"{path} cannot be read as a run's configuration: {error}".splitlines()[0]) from error
+    except (OSError, ValueError) as error:
+        raise _unreadable(str(path), error) from error
+
+
+def parse_config(text: str, origin: str) -> RunConfig:
+    """Parses the content of the file.
+
+    Args:
+        text: YAML.
+        origin: Where it comes from, for messages.
+
+    Raises:
+        UserError: It is not YAML, or not the configuration of a run.
+    """
+    if text.startswith(_BEGIN) and _END not in text.splitlines():
+        raise UserError(f"{origin} is truncated: the line {_END!r} is missing; restore it from a copy")
+    try:
+        plain = yaml.load(text, _Loader)
+    except (ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: an invalid date
+        raise _unreadable(origin, error) from error
     for part, name in _MOVED:
         if isinstance(plain, dict) and isinstance(plain.get(part), dict):
             plain[part].pop(name, None)
-    return from_plain(RunConfig, plain, str(path))
+    return from_plain(RunConfig, plain, origin)
+
+
+def _unreadable(origin: str, error: Exception) -> UserError:
+    return UserError(f"{origin} cannot be read as a run's configuration: {error}".splitlines()[0])

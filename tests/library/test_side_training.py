@@ -87,7 +87,9 @@ def test_it_ends_when_its_parent_is_killed(config: RunConfig, tmp_path: Path) ->
     write_config(tmp_path / "config.yaml", replace(config, train=TrainConfig(steps=1_000_000)))
     run = tmp_path / "run"
     command = [sys.executable, "-c", PARENT, str(tmp_path / "config.yaml"), str(run)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+    (tmp_path / "temporary").mkdir()
+    environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as parent:
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         deadline = time.monotonic() + 120
@@ -98,3 +100,4 @@ def test_it_ends_when_its_parent_is_killed(config: RunConfig, tmp_path: Path) ->
     while is_alive(child) and time.monotonic() < deadline:
         time.sleep(0.2)
     assert not is_alive(child)
+    assert list((tmp_path / "temporary").glob("wildgs*")) == []

@@ -1,4 +1,4 @@
-"""The other process of `training_beside`: `python -m wildgs.library.side_process CONFIG FOLDER THREADS`.
+"""The other process of `training_beside`: `python -m wildgs.library.side_process FOLDER THREADS < CONFIG`.
 
 It starts by compiling kernels, so that two processes share this work while the other one still reads photos.
 Modules that this does not need are imported afterwards.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,19 +21,25 @@ if TYPE_CHECKING:
 
 
 def main(config: str, folder: str, threads: str) -> None:
-    """Compiles kernels, then trains until the end, or until the process that started this one has ended."""
+    """Compiles kernels, then trains until the end, or until the process that started this one has ended.
+
+    Args:
+        config: Content of the run's configuration file.
+        folder: The run folder.
+        threads: Number of threads.
+    """
     parent = os.getppid()
     with limited(int(threads)):
         compile_kernels()
 
-        from wildgs.config_file import read_config
+        from wildgs.config_file import parse_config
         from wildgs.library.training import train
 
         def stop_if_orphaned(report: StepReport) -> None:
             if os.getppid() != parent:
                 raise KeyboardInterrupt
 
-        read = read_config(Path(config))
+        read = parse_config(config, "standard input")
         train(read.scene, read, output=folder, resume="auto", observers=[stop_if_orphaned])
 
 
@@ -47,4 +52,4 @@ def compile_kernels() -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.stdin.buffer.read().decode(), *sys.argv[1:])

@@ -9,13 +9,12 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from wildgs.config import ExecutionConfig, RunConfig
-from wildgs.config_file import write_config
+from wildgs.config_file import config_text
 from wildgs.runs import default_device
 from wildgs.threads import kernels_limited, limited, thread_count
 
@@ -48,14 +47,8 @@ def training_beside(
         yield (lambda _: None), None
         return
     share = max(1, total // 4)
-    with contextlib.ExitStack() as limits, tempfile.TemporaryDirectory(prefix="wildgs-") as place:
-        file = Path(place) / "config.yaml"
-        write_config(file, config)
-        command = [sys.executable, "-m", "wildgs.library.side_process", str(file), str(folder), str(share)]
-        # Without output: if it fails, the caller's own training reports why.
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+    with contextlib.ExitStack() as limits:
+        process = _start(config, folder, share)
         limits.enter_context(limited(total - share))
 
         widened = False
@@ -76,3 +69,19 @@ def training_beside(
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
+
+
+def _start(config: RunConfig, folder: Path, threads: int) -> subprocess.Popen[bytes]:
+    """Starts the process, which reads its configuration from its standard input.
+
+    A temporary file would remain if this process was killed. There is no output: if the other process fails, the
+    caller's own training reports why.
+    """
+    command = [sys.executable, "-m", "wildgs.library.side_process", str(folder), str(threads)]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    assert process.stdin is not None
+    with contextlib.suppress(OSError), process.stdin as pipe:
+        pipe.write(config_text(config).encode())
+    return process
