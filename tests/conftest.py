@@ -28,7 +28,9 @@ if hasattr(signal, "SIGHUP"):
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Workers of pytest-xdist share the cores; set before torch and the processes that tests start read it.
+# Workers of pytest-xdist share the cores; set before torch and the processes that tests start read it. Numba's
+# OpenMP layer (gsply, demo_generator) sets torch's number of threads to its own: two threads of each worker would
+# wait for each other in all later tests.
 if "PYTEST_XDIST_WORKER" in os.environ:
     _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
     for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "WILDGS_NUM_THREADS"):
@@ -64,19 +66,6 @@ def few_suns(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(shadows, "_ELEVATIONS", torch.tensor([10.0, 50.0]))
     monkeypatch.setattr(shadows, "_AZIMUTHS", torch.tensor([0.0, 120.0, 240.0]))
-
-
-@pytest.fixture(autouse=True)
-def threads_stay() -> Iterator[None]:
-    """Restores torch's number of threads, which Numba's OpenMP layer (gsply, demo_generator) sets to its own.
-
-    Later tests would be several times as slow: the workers' threads would wait for each other.
-    """
-    import torch
-
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -59,13 +59,14 @@ def read_config(path: Path) -> RunConfig:
             raise UserError(
                 f"{path} is larger than {MAX_CONFIG_BYTES} bytes; it is not a run's configuration"
             )
-        return parse_config(path.read_text(encoding="utf-8"), str(path))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise UserError(
             f"{path.parent} contains no run: {path.name} is missing; give another folder, or train without --resume"
         ) from error
     except (OSError, ValueError) as error:
         raise _unreadable(str(path), error) from error
+    return parse_config(text, str(path))
 
 
 def parse_config(text: str, origin: str) -> RunConfig:
